@@ -312,18 +312,16 @@ struct TensorSteps {
     const ProductValue a = product_value<true>(tile, step.x, step.is(kXWords));
     const ProductValue b = product_value<true>(tile, step.y, step.is(kYWords));
     const bool words = Numbers::kHalves && a.has_words && b.has_words;
-    const int lane = lane_again(), down = padded(a.columns, 16);
-    float* const partial = tile.partial() + step.number;
+    const int down = padded(a.columns, 16);
     int i0 = 16 * static_cast<int>(thread_again() / 32), j0 = 0;
 #pragma unroll 1
     for (;; i0 += static_cast<int>(threads_again() / 2)) {
       for (; i0 >= down; j0 += 32) i0 -= down;  // a division takes longer
       if (j0 >= b.columns) break;
-      float* const corner = partial + (i0 + lane / 4) * step.stride + j0 + 2 * (lane % 4);
       if (words) {
-        outer_words(tile, step, a, b, corner, i0, j0);
+        outer_block<Numbers::kHalves>(tile, step, a, b, i0, j0);
       } else {
-        outer_floats(tile, step, a, b, partial, i0, j0);
+        outer_block<false>(tile, step, a, b, i0, j0);
       }
     }
   }
@@ -340,49 +338,49 @@ struct TensorSteps {
   template <int kTiles>
   using Sums = float[kTall][kTiles][4];
 
-  // Computes 16 by 32 entries of an outer product of words. Their padding is 0, and the partial has space for it.
-  static __device__ __forceinline__ void outer_words(const Tile& tile, const CudaStep& step, const ProductValue& a,
-                                                     const ProductValue& b, float* corner, int i0, int j0) {
+  // Computes 16 by 32 entries of an outer product. kWords: of words, whose padding is 0; the partial has space for it.
+  template <bool kWords>
+  static __device__ __forceinline__ void outer_block(const Tile& tile, const CudaStep& step, const ProductValue& a,
+                                                     const ProductValue& b, int i0, int j0) {
     const int lane = lane_again();
     const bool fill = tile.fill(), swapped = step.is(kSwapped);
+    const bool whole = kWords || (i0 + 16 <= a.columns && j0 + 32 <= b.columns);
+    float* const partial = tile.partial() + step.number;
+    float* const corner = partial + (i0 + lane / 4) * step.stride + j0 + 2 * (lane % 4);
     const auto entries = [&](int t) { return reinterpret_cast<float2*>(corner + t % 2 * 8 * step.stride + t / 2 * 8); };
     float2 previous[8];  // loaded while the products run
 #pragma unroll
-    for (int t = 0; t < 8; ++t) previous[t] = fill ? make_float2(0.0f, 0.0f) : *entries(t);
+    for (int t = 0; t < 8; ++t) previous[t] = whole && !fill ? *entries(t) : make_float2(0.0f, 0.0f);
     float sums[4][4] = {};
-    if (step.bias >= 0 && i0 == 0) {
+    // The padding after the columns of a row only affects sums that are not stored.
+    const bool floats = !Numbers::kHalves && tile.all() % Tile::kRows == 0 && step.x.start + i0 + 16 <= step.x.stride &&
+                        step.y.start + j0 + 32 <= step.y.stride;
+    if (kWords && step.bias >= 0 && i0 == 0) {
       float columns[4][4] = {};
       multiply_transposed<true, true>(sums, columns, tile, a, b, i0, j0, swapped, lane);
       add_columns(columns, tile.partial() + step.bias + j0, fill, lane);
-    } else {
+    } else if (kWords || floats) {
       multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+    } else {
+      multiply_transposed<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
+    }
+    if constexpr (!kWords) {
+      if (!whole) {
+#pragma unroll
+        for (int i = 0; i < 16; ++i) {
+          const MapPlace at = accumulator_place(static_cast<unsigned>(lane), i % 4);
+          const int from = i0 + at.row, to = j0 + i / 4 * 8 + at.column;
+          if (from >= a.columns || to >= b.columns) continue;
+          float& entry = partial[from * step.stride + to];
+          entry = (fill ? 0.0f : entry) + sums[i / 4][i % 4];
+        }
+        return;
+      }
     }
 #pragma unroll
     for (int t = 0; t < 8; ++t) {
       const float x = sums[t / 2][t % 2 * 2] + previous[t].x, y = sums[t / 2][t % 2 * 2 + 1] + previous[t].y;
       *entries(t) = make_float2(x, y);
-    }
-  }
-  // The same if an operand has no words.
-  static __device__ __forceinline__ void outer_floats(const Tile& tile, const CudaStep& step, const ProductValue& a,
-                                                      const ProductValue& b, float* partial, int i0, int j0) {
-    const int lane = lane_again();
-    const bool fill = tile.fill(), swapped = step.is(kSwapped);
-    float sums[4][4] = {};
-    // The padding after the columns of a row only affects sums that are not stored.
-    if (!Numbers::kHalves && tile.all() % Tile::kRows == 0 && step.x.start + i0 + 16 <= step.x.stride &&
-        step.y.start + j0 + 32 <= step.y.stride) {
-      multiply_transposed<true, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
-    } else {
-      multiply_transposed<false, false>(sums, sums, tile, a, b, i0, j0, swapped, lane);
-    }
-#pragma unroll
-    for (int i = 0; i < 16; ++i) {
-      const MapPlace at = accumulator_place(static_cast<unsigned>(lane), i % 4);
-      const int from = i0 + at.row, to = j0 + i / 4 * 8 + at.column;
-      if (from >= a.columns || to >= b.columns) continue;
-      float& entry = partial[from * step.stride + to];
-      entry = (fill ? 0.0f : entry) + sums[i / 4][i % 4];
     }
   }
 
