@@ -63,17 +63,21 @@ __device__ __forceinline__ void hash_add(float* to, const float (&values)[kFeatu
   for (int f = 0; f < kFeatures; f += kCount) add_in_global<kCount>(to + f, values + f);
 }
 
-// Calls run(index of the entry's first feature, x, y, z) for each corner; x, y and z are 0 at the lower and 1 at the
-// upper corner of their axis.
+// Calls run(corner, x, y, z) for each of the eight corners; x, y and z are 0 at the lower and 1 at the upper corner of
+// their axis.
+template <typename Run>
+__device__ __forceinline__ void for_each_corner(const Run& run) {
+#pragma unroll
+  for (int corner = 0; corner < 8; ++corner) run(corner, corner & 1, corner >> 1 & 1, corner >> 2);
+}
+// Calls run(index of the entry's first feature, x, y, z) for each corner.
 template <int kFeatures, typename Run>
 __device__ __forceinline__ void hash_corners(const HashAxis (&axes)[3], const GridLevel& level, int64_t first,
                                              const Run& run) {
-#pragma unroll
-  for (int corner = 0; corner < 8; ++corner) {
-    const int x = corner & 1, y = corner >> 1 & 1, z = corner >> 2;
+  for_each_corner([&](int, int x, int y, int z) {
     const uint32_t entry = hash_entry(level, axes[0].corner + x, axes[1].corner + y, axes[2].corner + z);
     run(first + static_cast<int64_t>(entry) * kFeatures, x, y, z);
-  }
+  });
 }
 
 }  // namespace voronerf

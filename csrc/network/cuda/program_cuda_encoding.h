@@ -34,7 +34,7 @@ struct HashPoint {
 };
 struct HashCell {
   HashAxis axes[3];
-  uint32_t entries[8];  // of the corners, in the order of hash_corners
+  uint32_t entries[8];  // of the corners
 };
 // point(axis) returns a coordinate.
 template <typename Point>
@@ -50,16 +50,11 @@ __device__ __forceinline__ HashCell hash_cell(const HashPoint& point, const Grid
   HashCell result;
 #pragma unroll
   for (int axis = 0; axis < 3; ++axis) result.axes[axis] = hash_axis(point.places[axis], level);
-  hash_corners<1>(result.axes, level, 0, [&](int64_t entry, int x, int y, int z) {
-    result.entries[x + 2 * y + 4 * z] = static_cast<uint32_t>(entry);
+  for_each_corner([&](int corner, int x, int y, int z) {
+    const HashAxis* const axes = result.axes;
+    result.entries[corner] = hash_entry(level, axes[0].corner + x, axes[1].corner + y, axes[2].corner + z);
   });
   return result;
-}
-// Calls visit(corner, x, y, z) for each corner.
-template <typename Visit>
-__device__ __forceinline__ void for_each_corner(const Visit& visit) {
-#pragma unroll
-  for (int corner = 0; corner < 8; ++corner) visit(corner, corner & 1, corner >> 1 & 1, corner >> 2);
 }
 
 // Loads the features from `first` on of a cell's corners, from the table of the tile's cell. The code is separate for
