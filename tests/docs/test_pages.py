@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers import script
@@ -27,6 +28,12 @@ def test_python_on_a_page_runs(name: str) -> None:
     names = {"__name__": "__main__"}
     for number, code in enumerate(blocks_to_run, 1):
         exec(compile(code, f"{name}, block {number}", "exec"), names)
+
+
+def test_the_example_of_a_codebase_runs() -> None:
+    names: dict[str, Any] = {"__name__": "__main__"}
+    exec(compile(blocks("docs/use-in-your-codebase.md")[0], "docs/use-in-your-codebase.md", "exec"), names)
+    assert names["router"].num_cells == 16 and names["router"].explain() == "forward: fused"
 
 
 @pytest.mark.parametrize("name", PAGES)
