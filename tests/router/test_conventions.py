@@ -1,8 +1,8 @@
 """Tests of VoronoiRouter on fields in the styles of other codebases: every row against a loop over masks.
 
-The rows of `benchmarks/ops/foreign_kinds.py` with `ways` are tested. Tests of every run compare each way once; long
-tests compare second derivatives, identical cells, empty batches and subdivisions, and batches of many sizes
-(`tests/benchmarks/test_foreign_modules.py`).
+The rows of `benchmarks/ops/foreign_kinds.py` with `ways` are tested. Tests of every run compare the first way of a
+row. Long tests compare its other ways, second derivatives, identical cells, empty batches and subdivisions, and batches
+of many sizes (`tests/benchmarks/test_foreign_modules.py`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ ROWS = [(kind, row) for kind, rows in KINDS.items() for row in rows]
 
 
 def each_way(rows: list[tuple[str, Row]]) -> Any:
-    pairs = [pytest.param(row, way, id=f"{kind}, {row.module}, {way}") for kind, row in rows for way in row.ways]
+    """Parametrizes a test with rows and ways; only long tests take other ways than the first of a row."""
+    pairs = [
+        pytest.param(row, way, id=f"{kind}, {row.module}, {way}", marks=[pytest.mark.slow] * (way != row.ways[0]))
+        for kind, row in rows
+        for way in row.ways
+    ]
     return pytest.mark.parametrize(("row", "way"), pairs)
 
 
