@@ -307,6 +307,9 @@ def link_requirements(metadata, extras, packages, seen=None) -> None:
         chosen = [wanted.marker is None or wanted.marker.evaluate({"extra": extra}) for extra in ("", *extras)]
         if not any(chosen) or wanted.name in seen:
             continue
+        if wanted.name == metadata.name:  # an extra that includes another one
+            link_requirements(metadata, wanted.extras, packages, seen)
+            continue
         seen.add(wanted.name)
         distribution = importlib.metadata.distribution(wanted.name)
         for name in {file.parts[0] for file in distribution.files or () if file.parts[0] not in ("..", "__pycache__")}:

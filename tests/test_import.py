@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from voronerf import ops
+from voronerf import app, ops
+from voronerf.app.cli.info import EXTRAS
 from voronerf.ops._core import backends
 
 START = """
@@ -28,6 +29,17 @@ for backend in ("native", "reference"):
     router(torch.rand(5, 3), torch.rand(5, 3))[1].sum().backward()
 """
 
+LIBRARY = """
+import importlib, pkgutil, torch, voronerf
+for part in voronerf._PARTS:
+    package = importlib.import_module(f"voronerf.{part}")
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        importlib.import_module(module.name)
+router = voronerf.VoronoiRouter(torch.nn.Linear(3, 4), torch.rand(8, 3), coords="first3")
+optimizer = torch.optim.Adam(router.parameters())
+router(torch.rand(64, 3)).square().mean().backward()
+optimizer.step()
+"""
 
 TRAINING = """
 import sys, tempfile, pathlib, torch
@@ -66,16 +78,39 @@ def test_neither_first_calls_nor_a_training_print_or_import_compilers(code: str)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
-def test_a_missing_torch_is_one_line(tmp_path) -> None:
+def without(*packages: str, code: str) -> subprocess.CompletedProcess[str]:
+    """Runs code in a process that cannot import the packages."""
+    absent = f"import sys; sys.modules.update(dict.fromkeys({packages}))\n"
+    return subprocess.run([sys.executable, "-c", absent + code], capture_output=True, text=True)
+
+
+def test_a_missing_torch_is_one_line() -> None:
     line = "voronerf needs PyTorch 2.9 or newer, which is not installed: pip install torch\n"
-    without, program = (
-        "import sys; sys.modules['torch'] = None; ",
-        "from voronerf.app.cli import main; sys.exit(main())",
-    )
+    program = "from voronerf.app.cli import main; sys.exit(main())"
     for code, text in (("from voronerf import NeRF", f"ImportError: {line}"), (program, f"voronerf: error: {line}")):
-        run = subprocess.run([sys.executable, "-c", without + code], capture_output=True, text=True)
+        run = without("torch", code=code)
         assert run.returncode == 1 and run.stderr.endswith(text) and run.stderr.count("Traceback") == ("I" in text[:1])
         assert "During handling" not in run.stderr
+
+
+@pytest.mark.native
+def test_the_library_needs_no_extra() -> None:
+    run = without(*(name for extra in EXTRAS.values() for name in extra.modules), code=LIBRARY)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+def test_a_missing_extra_of_the_application_is_one_line() -> None:
+    program = "import runpy; runpy.run_module('voronerf', run_name='__main__')"
+    for packages, code, kind in (
+        (app.PACKAGES, program, "voronerf: error"),
+        (("rich",), program, "voronerf: error"),
+        (app.PACKAGES, "from voronerf.app import open_run", "ImportError"),
+        (("safetensors",), "import voronerf.editing", "ImportError"),
+    ):
+        line = f"the command line and voronerf.app need {', '.join(packages)}: pip install 'voronerf[app]'"
+        run = without(*packages, code=code)
+        assert run.returncode == 1 and run.stderr.endswith(f"{kind}: {line}\n"), run.stderr
+        assert run.stderr.count("\n") == 1 or kind == "ImportError"
 
 
 def test_threads_of_the_command_sleep_while_they_wait() -> None:

@@ -186,7 +186,7 @@ def test_info_lists_the_extras(capsys, monkeypatch):
 
 def test_what_the_demo_installs_is_what_the_package_needs():
     project = (ROOT / "pyproject.toml").read_text()
-    lists = (re.search(rf"\n{name} = \[(.*?)\]", project, re.DOTALL)[1] for name in ("requires", "dependencies"))
+    lists = (re.search(rf"\n{name} = \[(.*?)\]", project, re.DOTALL)[1] for name in ("requires", "dependencies", "app"))
     needed = {name for text in lists for name in re.findall(r'"([a-z0-9-]+)', text)}
     pinned = set(re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.txt").read_text(), re.MULTILINE))
     assert pinned == needed | {"wheel"}

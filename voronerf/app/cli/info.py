@@ -11,6 +11,7 @@ from typing import NamedTuple
 from rich.markup import escape
 from rich.table import Table
 
+from voronerf.app import PACKAGES
 from voronerf.app.cli.display import console, say
 from voronerf.app.run import open_run
 from voronerf.nerf import RayLoss
@@ -25,6 +26,7 @@ class Extra(NamedTuple):
 
 
 EXTRAS = {
+    "app": Extra("the command line, and voronerf.app in programs", PACKAGES),
     "export": Extra("voronerf export: points, meshes, cells", ("trimesh", "skimage", "scipy")),
     "viewer": Extra("voronerf view and train --view, in the browser", ("viser",)),
     "colmap": Extra("voronerf process: cameras of a video or of pictures", ("pycolmap",)),
