@@ -132,7 +132,7 @@ void encode_transposed(const float* x, int64_t x_stride, int64_t rows, const Col
     load_points(x + 3 * v * kLanes, points[0][v], points[1][v], points[2][v]);
   }
   for (int64_t f = 0; f < d; ++f) {
-    F32 values_of_x[kVectors], sine[kVectors], cosine[kVectors];
+    F32 values_of_x[kVectors], sine[kVectors] = {}, cosine[kVectors] = {};  // octave 0 sets them, which gcc cannot tell
     float lanes[kTransposed];
     for (int64_t row = 0; !direct && row < kTransposed; ++row) lanes[row] = x[smaller(row, rows - 1) * x_stride + f];
     for (int v = 0; v < kVectors; ++v) values_of_x[v] = direct ? points[f][v] : load(lanes + v * kLanes);

@@ -31,8 +31,8 @@ VN_INLINE F32 interleave(F32 even, F32 odd) {
 
 // Returns one of two joined vectors as floats: the first (half 0) or the second (half 1).
 VN_INLINE F32 widened(F32 pairs, int half) {
-  const __m256i values =
-      half == 0 ? _mm512_castsi512_si256((__m512i)pairs) : _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
+  __m256i values = _mm512_maskz_extracti64x4_epi64(0xf, (__m512i)pairs, 1);
+  if (half == 0) __builtin_memcpy(&values, &pairs, sizeof values);  // the cast warns in gcc 12 (simd.h)
   return (F32)_mm512_maskz_slli_epi32(0xffff, _mm512_maskz_cvtepu16_epi32(0xffff, values), 16);
 }
 
