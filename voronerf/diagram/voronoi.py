@@ -272,7 +272,7 @@ class VoronoiDiagram(nn.Module):
         return kept[1]
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes the index, which is a new one if centres have changed in place, as a dependency of a recorded step."""
+        """Notes the index of the centres for a recorded training step, which is recorded again when centres change."""
         noted.answer(self.index)
         return ()
 

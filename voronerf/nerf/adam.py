@@ -139,7 +139,7 @@ class Adam(torch.optim.Adam):
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
 
     def note_dependencies(self, noted: Any) -> list[Any]:
-        """Notes the attributes that a recorded update depends on; rates and ``steps_done`` may change."""
+        """Notes attributes for a recorded step, which is recorded again when they change; rates may change."""
         noted.contents(vars(self), ["steps_done", "decay"])
         noted.contents(self.param_groups)
         for group in self.param_groups:

@@ -77,7 +77,7 @@ class Contraction:
         return torch.stack((self.centre - 2 * self.radius, self.centre + 2 * self.radius))
 
     def gaussians(self, means: Tensor, directions: Tensor, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps Gaussians by the linearised map (equation 9): the covariance ``S`` becomes ``J S J^T``.
+        """Maps Gaussians by the linearised map (mip-NeRF 360, equation 9): the covariance ``S`` becomes ``J S J^T``.
 
         The covariance is ``S = along d d^T + across (1 - d d^T)``.
 

@@ -92,7 +92,7 @@ class RayLoss:
         return output
 
     def stages(self, generator: torch.Generator | None, backward: bool) -> list[Stage]:
-        """Returns the stages that read the result named "batch" and write the result named "output".
+        """Returns the parts of a training step that compute the loss ("output") of the rays ("batch").
 
         Args:
             generator: Random generator of the samples.
@@ -109,7 +109,7 @@ class RayLoss:
         return [sample, evaluate, *terms, learn]
 
     def uses(self) -> Iterable[Any]:
-        """Returns the objects that the stages use, except the terms."""
+        """Returns the objects that the evaluation of the loss reads, except the terms."""
         sampler = self.renderer.sampler
         return self, self.renderer, self.renderer.field, sampler, sampler.grid, self.radiance()
 
@@ -123,7 +123,10 @@ class RayLoss:
         return radiance if isinstance(radiance, str) else None
 
     def radiance(self, samples: tuple[Tensor, Tensor] | None = None) -> Radiance | str:
-        """Returns the field's program, or the reason why nothing is fused; for ``samples`` see `radiance_of`."""
+        """Returns the field as a program for fused ops, or the reason why nothing is fused.
+
+        For ``samples`` see `voronerf.nerf.radiance.radiance_of`.
+        """
         renderer = self.renderer
         if renderer.sampler.grid is None:
             return "empty space is not skipped"
@@ -253,7 +256,7 @@ class RayLoss:
         return run_backward(loss, defer)
 
     def explain(self) -> str:
-        """Describes in a few lines how a step is computed, and what prevents a faster way."""
+        """Describes in a few lines how a step is computed, and what prevents a faster computation."""
         renderer = self.renderer
         lines = [f"samples: {renderer.sampler.explain()}"]
         if (obstacle := self.why_not_fused()) is not None:

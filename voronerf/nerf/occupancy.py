@@ -71,7 +71,7 @@ class OccupancyGrid:
         occupied: bool [x, y, z], density >= threshold.
         threshold: The minimum density of an occupied voxel, in the unit of `density`.
         contraction: The contraction that maps world space to the space of the box, or None.
-        settled: The training step from which `Occupancy` updates the grid; None before.
+        settled: The training step of the first update by `Occupancy`; None before this step.
 
     Examples:
         >>> import torch

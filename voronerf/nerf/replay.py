@@ -173,7 +173,7 @@ class Results(NamedTuple):
     times: int = 1
 
     def now(self, value: Any) -> Any:
-        """Returns the attribute ``value``, or a part of it, with only the rows that this call has filled."""
+        """Returns the attribute ``value``, or an object in it, with only the rows that this call has filled."""
         return value if self.recording is None else self.recording.now(value)
 
 
@@ -365,7 +365,7 @@ class Replay:
         return last
 
     def _group(self) -> None:
-        """Divides the stages into segments; a segment keeps its back-off from those before."""
+        """Divides the stages into segments; an unchanged segment keeps its number of eager calls to come (back-off)."""
         before, self._segments = self._segments, []
         for place, (python, stages) in enumerate(itertools.groupby(self._stages, operator.attrgetter("python"))):
             kept = place < len(before) and before[place].python == python

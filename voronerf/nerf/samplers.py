@@ -82,7 +82,7 @@ class Sampler:
     Each training step calls :meth:`step_pre_backward`, then :meth:`sample` after drawing its rays, then
     :meth:`step_post_backward` after the optimiser. These hooks may change the sampler and its grid; after changes to
     other objects, the rest of the step runs eagerly. The tensors that a hook receives belong to the step, and must be
-    read before the hook returns. A replayed step calls the hooks that a subclass overrides, and replays the others.
+    read before the hook returns. A subclass's own hooks run in Python in every step; see :class:`TrainingStep`.
 
     Attributes:
         passes: The number of passes over a ray, each with its own number of samples.
@@ -90,7 +90,7 @@ class Sampler:
         samples: s, the number of samples per ray in the first pass.
         space: The coordinates in which rays are sampled and the field is evaluated.
         backend: The backend of the ops.
-        settling_steps: The least number of first training steps in which the grid is not updated.
+        settling_steps: The number of training steps, at least, before the first update of the grid.
 
     Args:
         samples: s, the number of samples per ray in the first pass, at least 1.
@@ -241,7 +241,7 @@ class Sampler:
         """
 
     def finish(self, field: Field, seed: int) -> None:
-        """Finishes the sampler after the last step of a training.
+        """Called after the last step of a training, for example to clean a grid; does nothing by default.
 
         Args:
             field: The trained field.
@@ -353,7 +353,7 @@ class Occupancy(Sampler):
 
     @property
     def settling_steps(self) -> int:  # type: ignore[override]
-        """The least number of first training steps in which the grid is not updated."""
+        """The number of training steps, at least, before the first update of the grid."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
     @property

@@ -119,8 +119,8 @@ class Strategy:
     Before each step the training loop checks :meth:`is_due`. If a split is due, the loop calls
     :meth:`step_pre_backward`, the only hook that may change networks and optimiser. After the optimiser, each step
     calls :meth:`step_post_backward`, which may change only the strategy itself. The tensors that the hook receives
-    belong to the step, and must be read before the hook returns. A replayed step calls the hooks that a subclass
-    overrides, and replays the other hooks.
+    belong to the step, and must be read before the hook returns. A subclass's own hooks run in Python in every
+    step; see :class:`TrainingStep`.
 
     Attributes:
         inherit: Whether new cells start as copies of their parent.
@@ -318,7 +318,7 @@ class SplitStrategy(Strategy):
         return SplitDone(split, points, importance)
 
     def forget(self) -> None:
-        """Drops the kept samples."""
+        """Drops the samples that were kept for the next split."""
         kept, device = self.reservoir, self.diagram.centres.device
         self.reservoir = SampleReservoir(kept.capacity, kept.batches, device=device)
 

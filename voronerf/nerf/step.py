@@ -158,10 +158,10 @@ class TrainingStep:
         self._start_anew()
 
     def run_within(self, context: Callable[[], AbstractContextManager[None]]) -> None:
-        """Sets the context manager in which steps and stages run if they are not replayed.
+        """Sets the context manager in which steps, or parts of them, run if they are not replayed.
 
         Args:
-            context: Function that returns a new context manager for each step or stage.
+            context: Function that returns a new context manager for each step or part.
         """
         self._context = context
 
@@ -262,7 +262,10 @@ class TrainingStep:
         return self, self.optimizer, self.guard, *self.loss.uses()
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes the attributes that a recorded step depends on; see `voronerf.nerf.replay.Stage`."""
+        """Notes attributes for a recorded step, which is recorded again when they change.
+
+        See `voronerf.nerf.replay.Stage`.
+        """
         names = "batches", "loss", "optimizer", "strategy", "guard", "generator", "autocast", "scaler", "ranks"
         noted.entries(vars(self), names)
         return ()

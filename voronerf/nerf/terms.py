@@ -47,7 +47,7 @@ class Slopes(NamedTuple):
 
     @classmethod
     def zeros(cls, weights: Tensor, error: Tensor) -> Slopes:
-        """Returns zeros for samples with ``weights`` [m] and rays with an ``error`` [r]."""
+        """Returns gradients of 0, with m and r, dtypes and devices from ``weights`` [m] and ``error`` [r]."""
         m, r = rows_of(weights), rows_of(error)
         of_rays = new_zeros(error, r, 3), new_zeros(error, r), new_zeros(error, r)
         return cls(*of_rays, new_zeros(weights, m), new_zeros(weights, m, 3), new_zeros(weights, m))
@@ -126,7 +126,7 @@ class Term(Protocol):
 
 @replayed
 class SparseDepth:
-    """A loss on light that does not come from the points of a sparse model.
+    """A depth loss: light of a ray should come from the point of the sparse (SfM) model on this ray.
 
     See `voronerf.ops.sparse_depth_loss`.
 
@@ -282,7 +282,7 @@ def _add_differentiated(
 ) -> None:
     """Adds a term that torch differentiates: a function of `RayValues` and their `Batch` that returns a scalar.
 
-    The function ``now`` cuts recorded tensors to the rows of the present step.
+    Recorded tensors have spare rows; the function ``now`` cuts them to the rows of the present step.
     """
     values = RayValues(along, batch, now)
     with torch.enable_grad():

@@ -55,7 +55,7 @@ def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str,
 
 
 class CachedCall:
-    """The calls of one kind as one program, made from the first call.
+    """The calls with one key as one program, made from the first of them.
 
     Args:
         fused: The traced module.

@@ -157,7 +157,10 @@ def _held_by(function: types.FunctionType, objects: dict[int, str]) -> str:
 
 
 def _refusal(part: nn.Module, registered: set[int]) -> str:
-    """Returns why a submodule cannot be in a network for each cell, or ""; ``registered`` are ids of parameters."""
+    """Returns why a module with this submodule cannot be copied for each cell, or "".
+
+    ``registered`` are the ids of the parameters.
+    """
     if isinstance(part, torch.jit.ScriptModule) and next(part.parameters(), None) is not None:
         return "is compiled by torch.jit, and cannot take the parameters of a cell (wrap the Python module)"
     if any(type(one).__name__.endswith("SpectralNorm") for one in (part, *part._forward_pre_hooks.values())):

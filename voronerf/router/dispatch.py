@@ -1,8 +1,9 @@
 """Runs routed calls in one of three ways: fused, grouped or cell by cell.
 
-The loop over cells defines the result. The first call of a kind makes a :class:`CallPlan`: its way is the first one, in
-this order, that is possible and whose results agree with the loop (:mod:`voronerf.router.probe`). The option ``way`` of
-a router names the way to begin with.
+The loop over cells defines the result. Calls are of one kind if they have the same method, modes, and types and sizes
+of arguments. The first call of a kind makes a :class:`CallPlan`: its way is the first of the three that is possible and
+whose results agree with the loop (:mod:`voronerf.router.probe`). The option ``way`` of a router names the way to begin
+with.
 """
 
 from __future__ import annotations
@@ -66,10 +67,10 @@ class _Checked(NamedTuple):
 
 @dataclass
 class CallPlan:
-    """The way in which calls of one kind run, and the values on which this way depends.
+    """The evaluation of calls with the same method, argument types and sizes, and the values on which it depends.
 
     Attributes:
-        way: The first way that is possible and agrees with the loop.
+        way: The fused, grouped or cell-by-cell evaluation: the first that is possible and agrees with the loop.
         loop: The loop over cells, which runs the batches for which ``way`` is impossible.
         may_group: Whether another batch may run grouped although the first did not.
         small: Whether the plan was made for fewer than ``FEWEST`` samples; the first larger call makes another plan.
@@ -92,7 +93,7 @@ class CallPlan:
 
     @property
     def fused(self) -> Fused | None:
-        """The fused way, or None."""
+        """The fused module, or None if these calls do not run fused."""
         return self.way if isinstance(self.way, Fused) else None
 
     def changed(self, constants: dict[str, Any]) -> list[Source]:
@@ -130,7 +131,7 @@ class Dispatch:
         self._latest_ways: dict[str, dict[str, str]] = {}
 
     def explain(self, methods: tuple[str, ...], default_ways: Mapping[str, str]) -> str:
-        """Returns a line for each method: its latest ways and the reasons, or its default way before any call."""
+        """Returns a line for each method: whether it ran fused, grouped or cell by cell, and why; or its default."""
         latest = [(m, self._latest_ways.get(m, {default_ways.get(m, "not called yet"): ""})) for m in methods]
         ways = [(method, *way) for method, ways in latest for way in list(ways.items())]
         return "\n".join(f"{method}: {name}{f': {why}' if why else ''}" for method, name, why in ways)
@@ -138,7 +139,7 @@ class Dispatch:
     def program(
         self, call: Call, grouping: Grouping | None, device: torch.device, k: int, options: Options, backend: str
     ) -> CellProgram | str:
-        """Returns the program of a call of this kind, or the reason why it is unknown.
+        """Returns the program of calls like this one, or the reason why it is unknown.
 
         Args:
             call: The call.
@@ -246,7 +247,7 @@ class Dispatch:
         return checked
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
-        """Returns the plan for calls of this kind; a first call, or a call with changed constants, makes a plan."""
+        """Returns the plan for calls like this one; the first one, or one with changed constants, makes a plan."""
         layout, key = call.layout, _plan_key(call, grouping.device)
         constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
         plans = [plan for plan in self.plans.get(key, []) if few or not plan.small]

@@ -72,7 +72,7 @@ class ParameterEntries:
 
 @dataclass
 class Subprogram:
-    """A run of steps as one program, with its outputs and the sources of its inputs and parameters."""
+    """Adjacent steps as one program, with its outputs and with the tensors that its inputs and parameters read."""
 
     program: Program
     inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
@@ -191,7 +191,7 @@ class Fused:
         return max(map(self._lowering.level, self._lowering.values(self._entries[node].codes)), default=-1) + 1
 
     def _entries_of(self, node: fx.Node) -> Entries:
-        """Returns the sources of the entries of a node's value."""
+        """Returns, for each entry of a node's value, the sample and column or the parameter entry that it equals."""
         if node not in self._entries:
             value = node.meta["value"]
             if not value.is_floating_point():
@@ -245,7 +245,7 @@ class Fused:
             self._entries[value] = value_entries
 
     def _needed(self) -> set[fx.Node]:
-        """Returns the nodes that PyTorch computes, and collects the steps that those nodes and the results need."""
+        """Returns the nodes that PyTorch computes, and collects the steps that these nodes and the results need."""
         needed: set[fx.Node] = set()
         lowering, steps = self._lowering, self._lowering.builder.steps
         self._columns: dict[fx.Node, Columns] = {}
@@ -489,7 +489,7 @@ def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, o
 
 
 def _match_strides(entries: Entries, tensor: Tensor) -> None:
-    """Gives codes the strides of their tensor, which decide whether a later view is possible."""
+    """Gives the tensor of entry codes (`Entries`) its tensor's strides, by which PyTorch allows later views."""
     if entries.codes.stride() != tensor.stride() and 0 not in tensor.stride():
         codes = torch.empty_strided(tensor.shape, tensor.stride(), dtype=entries.codes.dtype, device="cpu")
         entries.codes = codes.copy_(entries.codes)

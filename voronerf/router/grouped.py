@@ -167,7 +167,7 @@ class Ungroupable(Exception):
 
     Attributes:
         of_batch: Whether another batch may be groupable.
-        is_new: Whether the module did what no :class:`CallAxes` tells, so that a new record may help.
+        is_new: Whether the module called functions that no :class:`CallAxes` describes, so a new record may help.
     """
 
     def __init__(self, reason: str, of_batch: bool = False, is_new: bool = False) -> None:
@@ -503,11 +503,11 @@ class GroupedRun(TorchFunctionMode):
 
 
 class Way(Protocol):
-    """One way to run a call.
+    """A method to evaluate a call for all cells: fused, grouped or cell by cell.
 
     Attributes:
         name: "fused", "grouped" or "cell by cell".
-        why: The reason why no faster way runs, or an empty text.
+        why: The reason why no faster method runs, or an empty text.
     """
 
     name: str
@@ -520,7 +520,7 @@ class Way(Protocol):
 
 @dataclass
 class Grouped:
-    """The grouped way: the module's own ``forward`` runs once for the rows of all cells.
+    """The grouped evaluation: the module's own ``forward`` runs once for the rows of all cells.
 
     On a CPU, ``forward`` runs on pieces of the rows, so that its tensors fit in the cache.
     """

@@ -273,7 +273,7 @@ class NotAStep(Exception):
 
 
 class Entries:
-    """The sources of a tensor's entries.
+    """The origin of each entry of a tensor: a sample and a column, or an entry of a parameter.
 
     Attributes:
         codes: A code for each entry, in the tensor's shape, on the CPU: (sample << 32) + column for a tensor of

@@ -1,7 +1,7 @@
-"""Finds a way whose results agree with the loop over cells.
+"""Finds the fastest evaluation (fused or grouped) whose results agree with the loop over cells.
 
-Each way runs once on a few samples of the first batch, in a copy of the module whose cells have different parameters.
-Results and gradients are compared.
+Each of them runs once on a few samples of the first batch, in a copy of the module whose cells have different
+parameters. Results and gradients are compared.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ Outcome = tuple[Results, list[Tensor]]  # results and gradients
 
 @dataclass(frozen=True)
 class Options:
-    """The options of a router that decide which ways are tried."""
+    """The options of a router that decide which evaluations (fused, grouped) are tried."""
 
     fuse: bool  # user promises that ``forward`` is a pure function
-    way: str  # the first way to try: "fused", "grouped" or "loop"
+    way: str  # the first evaluation to try: "fused", "grouped" or "loop"
     many_methods: bool  # whether several methods are routed; if so, a method that cannot be fused is no error
     names: tuple[str, ...]  # names of the parameters that the module was wrapped with
 
@@ -113,7 +113,7 @@ class Probe:
     def find_way(
         self, options: Options, warn_once: Callable[[str, str], None], inputs: Sequence[Inputs], too_many: str = ""
     ) -> tuple[Way, Loop, bool]:
-        """Returns the first way that agrees with the loop, the loop, and whether another batch may run grouped.
+        """Returns the fastest evaluation equal to the loop, the loop, and whether another batch may run grouped.
 
         The module is fused with the first of ``inputs`` that succeeds. It is not fused if its constants have changed
         too often; ``too_many`` is then the explanation, otherwise it is empty.
@@ -124,7 +124,7 @@ class Probe:
         """
         call = self._call
         steps: Callable[[], list[CallAxes]] = self.steps
-        with contextlib.suppress(Exception):  # the way names the reason
+        with contextlib.suppress(Exception):  # the result's ``why`` names the reason
             steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
         for loop in (Loop(), Loop(again=True)):
             try:
@@ -211,8 +211,10 @@ class Probe:
         }
 
     def note_changes(self, warn_once: Callable[[str, str], None]) -> ProbeRuns:
-        """Records the module, and notes what calls cannot keep: items of containers (CHANGES), numbers, and counts."""
+        """Records two runs of the module, and notes values that must not pass from one call to the next.
 
+        These are the items of containers (CHANGES), numbers, and numbers of samples.
+        """
         initial, call = self._containers(), self._source[0]
         if initial:
             self.run_once(self._call.module)
@@ -263,12 +265,12 @@ class Probe:
         return True
 
     def _run(self, way: Way) -> Results:
-        """Returns the results of a way, with random numbers of 0."""
+        """Returns the results of an evaluation, with random numbers of 0."""
         with NoRandomness() if isinstance(way, Loop) else contextlib.nullcontext():  # fused networks draw no numbers
             return way.run(self._call, self._entries)
 
     def _outcome(self, way: Way) -> Outcome:
-        """Returns the results of a way, and the gradients of a weighted sum of them."""
+        """Returns the results of an evaluation, and the gradients of a weighted sum of them."""
         results, generator, total = self._run(way), torch.Generator().manual_seed(7), []
         for tensor in results.tensors:
             tensor = torch.view_as_real(tensor) if tensor.is_complex() else tensor
@@ -285,7 +287,7 @@ class Probe:
         return results, gradients
 
     def _agrees(self, way: Way, loop: Way, expected: Outcome) -> bool:
-        """Returns whether the results and gradients of a way agree with the loop.
+        """Returns whether the results and gradients of an evaluation agree with the loop.
 
         If they differ, both are computed and compared again without autocast, and then in float64. With autocast,
         rounding errors exceed the tolerance; in a deep network of sines of high frequency, they are as large as the
@@ -306,7 +308,7 @@ class Probe:
         return False
 
     def _fused(self, loop: Way, expected: Outcome, inputs: Sequence[Inputs]) -> Way:
-        """Returns the fused way; raises an exception if the network cannot be fused."""
+        """Returns the fused evaluation; raises an exception if the network cannot be fused."""
         for candidate in inputs:
             try:
                 with NoRandomness():
@@ -472,6 +474,6 @@ def check_subclasses(call: Call, plain: Call) -> None:
     if why:
         kind = next(type(x).__name__ for x in tensors_of((call.args, call.kwargs)) if as_plain(x) is not x)
         raise TypeError(
-            f"{_OP}: {call.name} must work with plain tensors, as rows of cells are, but needs a {kind} ({why}); "
-            f"extract what it needs from the {kind} before the call"
+            f"{_OP}: {call.name} must work with plain tensors, which hold the rows of a cell, but "
+            f"needs a {kind} ({why}); extract what it needs from the {kind} before the call"
         )

@@ -73,17 +73,17 @@ class VoronoiRouter(nn.Module):
     split. The parameters of all copies are stacked, ``[k, ...]``, under the module's own names with the prefix
     ``module.``: an optimiser sees as many tensors as for one module. Buffers are shared by all cells.
 
-    The reference is a loop over the cells, which runs each copy on its samples. A call uses the first possible one of
-    the following ways, whose results are compared with the reference once for each kind of call. :meth:`explain`
-    reports the way, and the reason why an earlier one is impossible:
+    The reference is a loop over the cells, which runs each copy on its samples. A call runs as the first possible
+    item of the following list; its results are compared with the reference in the first call of a method with these
+    types and sizes of arguments. :meth:`explain` says which item, and why an earlier one is impossible:
 
     - fused: one operation for the whole network. This needs a field with a method ``program``
       (:func:`voronerf.router.layered_program`), or ``fuse=True``.
     - grouped: the module's own ``forward`` runs once, on the samples of all cells sorted by cell. Functions that take
       parameters have a rule for all cells at once: linear layers (also ``F.linear``, ``@``, ``einsum``), recurrent
       layers, embeddings, normalisation layers, scales. :func:`voronerf.router.register` adds a rule.
-    - cell by cell: the module runs once for each cell that has samples. A warning names the step that prevents a faster
-      way.
+    - cell by cell: the module runs once for each cell that has samples. A warning names the line of code that
+      prevents a faster evaluation.
 
     A module that mixes samples (BatchNorm in training mode, attention across samples) is refused.
 
@@ -123,8 +123,9 @@ class VoronoiRouter(nn.Module):
             is traced and runs as one operation; if this is impossible, an error names the line. Changed numbers,
             attributes and buffers take effect, except writes by ``buffer.data`` or in inference mode to buffers above 1
             MiB or on a GPU; write these by ``buffer.copy_(...)``.
-        way: The first way to try: "fused" (which needs ``fuse=True``), "grouped" or "loop". If it is impossible, the
-            next way in this order runs. With few cells, "loop" may be faster than "grouped".
+        way: The evaluation of calls, see above: "fused" (which needs ``fuse=True``), "grouped" or "loop" (cell by
+            cell). If it is impossible, the next one in this order runs. With few cells, "loop" may be faster than
+            "grouped".
         layout: The shape in which the module gets samples ``[rays, samples, f]``: "rays" for ``[n, 1, f]``, with
             per-ray arguments as ``[n, f]``; "flat" for ``[n, f]``, for modules that squeeze or flatten.
         assignment: "nearest" evaluates a sample in the cell that holds it. "stochastic" draws the cell at random by the
@@ -372,7 +373,7 @@ class VoronoiRouter(nn.Module):
 
     @torch.inference_mode(False)
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Unfreezes cells, given as in `freeze`; they keep the optimiser's moments from before."""
+        """Unfreezes cells, which keep the optimiser's moments from before. For ``cells`` see `freeze`."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
@@ -585,12 +586,13 @@ class VoronoiRouter(nn.Module):
         return d
 
     def places(self, positions: Tensor, method: str | None = None) -> Cells:
-        """Returns the cells of samples, with the frozen cells.
+        """Returns the assignment of samples to cells, with the mask of frozen cells, as the ops take it.
 
         Args:
             positions: Positions [..., d] in scene units, Gaussians [n, 6], means and variances, or labels,
                 int32 [..., 1].
-            method: The called method, which shares its cells with other methods at the same positions; or None.
+            method: The name of the called method. It reuses the cells that another of ``methods`` has found at the
+                same positions. None to find the cells anew.
         """
         diagram: Any = self._modules["diagram"]
         k, centres, frozen = diagram.num_cells, diagram._buffers["centres"], self._buffers["frozen_cells"]
@@ -613,10 +615,10 @@ class VoronoiRouter(nn.Module):
         return Cells(centres=centres, coords=coords, frozen=frozen, k=k, **tree)
 
     def program(self, *args: Tensor, trace: bool = False) -> CellProgram | str:
-        """Returns the program of ``forward``, or the reason why it is unknown.
+        """Returns the program (list of operations) of ``forward``, or the reason why it is unknown.
 
         A field's method ``program`` defines the program. For a module with ``fuse=True``, the program is known after
-        the first call with arguments of the same kind, which traces the module.
+        the first call with arguments of the same types and sizes, which traces the module.
 
         Args:
             *args: Tensors [n, w] as ``forward`` gets them, n >= 2.
@@ -656,12 +658,12 @@ class VoronoiRouter(nn.Module):
         )
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes the attributes that a recorded training step depends on."""
+        """Notes attributes for a recorded training step, which is recorded again when they change."""
         noted.entries(vars(self), ["assignment", "temperature", "backend", "coords"])
         return ()
 
     def explain(self) -> str:
-        """Returns a line for each method: the way in which its calls ran (fused, grouped or cell by cell), and why.
+        """Returns a line for each method: whether its calls ran fused, grouped or cell by cell, and why.
 
         Examples:
             >>> import torch

@@ -520,7 +520,7 @@ class _Source(torch.autograd.Function):
 
 
 class _LookUp(torch.autograd.Function):
-    """A look-up of rows of a :class:`_Source`; the indices count from the row ``first``."""
+    """An autograd function that looks up rows of a table, a :class:`_Source`; index 0 is its row ``first``."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, index: Tensor, buffer: list[Tensor]) -> Tensor:

@@ -75,7 +75,7 @@ def rows_for(module: nn.Module, tensors: list[Tensor]) -> int:
 
 
 def _remedy(usual: str) -> str:
-    """Returns how to avoid a refusal: the usual way, or another one while a distribution checks its arguments."""
+    """Returns the remedy that an error names: ``usual``, or another one while a distribution checks its arguments."""
     frame = inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__") != "torch.distributions.distribution":
         frame = frame.f_back

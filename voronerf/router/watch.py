@@ -137,7 +137,7 @@ class Watch:
 
 
 def module_dependencies(module: nn.Module) -> Any:
-    """Returns dependencies on a module's submodules and on the kinds of its parameters."""
+    """Returns dependencies on a module's submodules and on the types of its parameters."""
     dependencies = unchanged()
     for part, name, _ in owned_parameters(module):
         dependencies.kind(part._parameters, name)

@@ -92,7 +92,7 @@ class ColmapImage(NamedTuple):
 
 
 class ColmapModel(NamedTuple):
-    """A sparse model."""
+    """A sparse model of COLMAP: images with cameras, and points."""
 
     path: Path  # the file `images`
     images: list[ColmapImage]  # sorted by name

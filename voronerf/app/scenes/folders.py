@@ -213,8 +213,8 @@ def find_files(
     """Finds the image files in a folder and its subfolders of the names that have no file in ``exact``.
 
     A name is compared with a file's path: exactly, then with the suffix of the path removed, then with the suffixes of
-    the name and the path removed, where Unicode has several spellings for a name. Names without a file are compared in
-    the same three ways again, ignoring case. If none of the names has a file, they are compared by `compare_tails`.
+    the name and the path removed, where Unicode has several spellings for a name. Names without a file are compared by
+    the same three rules again, ignoring case. If none of the names has a file, they are compared by `compare_tails`.
 
     Args:
         source: the file that lists the names, for error messages.

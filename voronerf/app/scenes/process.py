@@ -115,7 +115,7 @@ Item = TypeVar("Item")
 
 
 class Settings(NamedTuple):
-    """The settings of all stages; a folder with results of other settings is refused.
+    """The settings of :func:`process` that decide its results; a folder with results of other settings is refused.
 
     Attributes:
         source: the paths of the sources.
@@ -133,7 +133,7 @@ class Settings(NamedTuple):
 
     @classmethod
     def of(cls, sources: Sequence[Path], **options: Any) -> Settings:
-        """Returns the settings of sources and of options of :func:`process`, of which some have no effect on stages."""
+        """Returns the settings for these sources and options of :func:`process`; options without effect are dropped."""
         sizes = [(str(file), file.stat().st_size) for source in sources for file in files_of(source)]
         listed = hashlib.sha256(json.dumps(sizes).encode(errors="surrogateescape")).hexdigest()
         paths = os.pathsep.join(str(path.resolve()) for path in sources)
@@ -160,7 +160,7 @@ class Settings(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """A mapper's model.
+    """A sparse model (cameras and points) from one of COLMAP's mappers.
 
     Attributes:
         folder: the folder of its files.
@@ -355,7 +355,7 @@ def _begin_images(
 
 @dataclass(frozen=True)
 class Stages:
-    """The files and settings of all stages."""
+    """The files and settings of all stages of :func:`process`: features, pairs, matches, cameras."""
 
     colmap: Any  # the module pycolmap
     work: Path  # the folder of the stages' results

@@ -94,7 +94,7 @@ class Scene:
         far: distance along a ray at which the scene ends.
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around the scene, or None if unknown.
         background: the colour behind transparent pixels, "white"; None for opaque images.
-        kind: one of `KINDS`.
+        kind: "object" on white, "forward" (cameras look the same way), "inside-out" or "unbounded", see `KINDS`.
         contraction: the contraction that makes the space of a scene without a box finite, or around a region of a
             scene; None for the sphere around the box, or around the origin and all cameras.
         region: float32 [2, 3], the box that the rays of all trained pixels meet; None for the whole scene.

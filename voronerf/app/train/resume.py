@@ -26,7 +26,7 @@ COUNTERS = ("step", "seconds", "evaluation_seconds", "reserved_seconds", "rays",
 
 @dataclass(frozen=True)
 class Stored:
-    """The values of a checkpoint except its tensors, named as in a state."""
+    """The values of a checkpoint except its tensors, named like the attributes of `State`."""
 
     config: dict[str, Any]
     step: int
@@ -104,7 +104,7 @@ def load(state: State, checkpoint: Checkpoint) -> None:
         state.generator.set_state(generators["state"])
         draws = generators["draws"]
         if state.draws is not state.generator and draws.shape == state.draws.get_state().shape:
-            state.draws.set_state(draws)  # otherwise the run began on another kind of device
+            state.draws.set_state(draws)  # otherwise the training began on another type of device, such as a GPU
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{checkpoint.source}: not a checkpoint of a training: {error}") from None
     counts = stored.threads, _threads(state)

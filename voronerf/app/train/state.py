@@ -39,7 +39,7 @@ class TrainingStage:
 
     ``balance_before`` and ``balance_after`` measure the imbalance before and after the centres of new cells are moved:
     the median over the split cells of std(W / max W), where W are the importances of a split cell's new cells. Both are
-    None for the coarse stage.
+    None for the coarse stage, the training with one cell.
     """
 
     cells: int
@@ -201,11 +201,11 @@ class State:
 
     @property
     def began(self) -> int:
-        """The step of the last start of the coarse stage, see `voronerf.app.train.start`."""
+        """The step at which the training with one cell last started or restarted, see `voronerf.app.train.start`."""
         return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def agree(self, steps: int) -> int:
-        """Takes over what depends on the clock or on samples from rank 0; returns its number of steps, 0 at the end."""
+        """Copies times and the number of rays from rank 0 to all ranks; returns rank 0's ``steps``, 0 at the end."""
         names = "seconds", "evaluation_seconds", "reserved_seconds", "rays"
         numbers, steps = self.ranks.first(([getattr(self, name) for name in names], steps))
         for name, number in zip(names, numbers, strict=True):
@@ -235,7 +235,7 @@ class State:
         self.evaluation_seconds, self.reserved_seconds = self.evaluation_seconds + seconds, reserved
 
     def begin_stage(self, done: SplitDone) -> None:
-        """Adds the stage of training that begins after a split."""
+        """Adds the period of training that begins after a split to ``stages``."""
         balances = list(done.split.balances.values())
         pairs = [(balance.imbalance_before, balance.imbalance_after) for balance in balances]
         imbalances = torch.tensor(pairs, dtype=torch.float32, device="cpu").view(-1, 2)
@@ -243,7 +243,7 @@ class State:
         self.stages.append(TrainingStage(self.router.num_cells, self.seconds, self.step, before, after, len(balances)))
 
     def begin_again(self) -> None:
-        """Adds a stage for a restart of the coarse stage, and resets the number of rays."""
+        """Adds an entry to ``stages`` for a restart with one cell, and resets the number of rays."""
         self.rays = int(self.config.rays or 0)
         self.stages.append(TrainingStage(1, self.seconds, self.step, None, None, 0))
 

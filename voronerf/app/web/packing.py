@@ -45,11 +45,11 @@ GREATEST = 65504.0
 
 @dataclass(frozen=True)
 class Packed:
-    """The contents of a page.
+    """The contents of a web page that draws a trained scene.
 
     Attributes:
         scene: The description, as JSON values.
-        data: The concatenated parts.
+        data: The bytes for the shader: parameters, tables, occupied voxels, centres and colours.
         shader: The source of the shader in WGSL.
     """
 

@@ -45,10 +45,10 @@ WORD, BLOCK = 8, 16
 
 
 class CannotDraw(ConfigError):
-    """An error for a run that a page cannot draw.
+    """A trained scene that the WebGPU page cannot draw.
 
     Args:
-        reason: The reason, as a clause about the run.
+        reason: The reason, as a clause about the trained scene.
     """
 
     def __init__(self, reason: str) -> None:
@@ -60,8 +60,8 @@ class ParameterOffsets:
     """The offsets of a cell's parameters, counted in float16 elements from the cell's first parameter.
 
     Attributes:
-        matrices: For each step that reads a matrix: the number of the parameter, its first column that is read, rows
-            o, columns i, and the offset of the blocks.
+        matrices: For each step of the network that reads a matrix: the number of the parameter, its first column that
+            is read, rows o, columns i, and the offset of the matrix, which is stored in blocks.
         vectors: For each bias: the number of the parameter, its first element that is read, width, and offset.
         size: Number of parameters of a cell, including padding.
     """

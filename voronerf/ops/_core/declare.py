@@ -390,20 +390,20 @@ class Declaration:
         return decorate
 
     def inputs(self, kind: Any, **others: Any) -> Binding:
-        """Returns the source of a compiled struct whose members are arguments.
+        """Returns the binding of a compiled struct whose members are arguments.
 
         Args:
             kind: the struct; its members have the names of arguments or letters of their shapes.
-            others: sources of members with other names: the name of an argument or letter, a function of the arguments,
+            others: values of members with other names: the name of an argument or letter, a function of the arguments,
                 or a constant.
 
         Raises:
-            NameError: a member has no source.
+            NameError: a member has no value.
         """
         return self._struct(kind, others, self.Inputs)
 
     def outputs(self, kind: Any, **others: str) -> Binding:
-        """Returns the source of a compiled struct whose members are the results' memory.
+        """Returns the binding of a compiled struct whose members are the results' memory.
 
         Args:
             kind: the struct.
@@ -431,7 +431,7 @@ class Declaration:
         return Binding(get, ("structure", [self._binding(value, of_results).plan for value in values]))
 
     def _binding(self, value: Any, of_results: bool = False) -> Binding:
-        """Returns the source of a parameter or a member.
+        """Returns the binding of a compiled function's parameter, or of a member of its structs.
 
         ``value`` is of one of the kinds that `compiled_op` lists for its parameters. With ``of_results``, a name that
         is both an argument and a result means the result.

@@ -186,7 +186,7 @@ class MLP:
         return (name, size) if size else None
 
     def source_width(self, source: int | str, positions_d: int, directions_d: int = 0) -> int:
-        """Returns the number of features of a source after encoding."""
+        """Returns the number of features of a layer's input: of an earlier layer, or of an input after encoding."""
         if isinstance(source, int):
             return self.layers[source].width
         if source == POSITIONS and self.grid is not None:

@@ -419,7 +419,7 @@ def _require(name: str, ok: bool, value: object, rule: str = "made of existing v
 
 
 class Builder:
-    """A builder of programs. It reuses the value of an equal earlier step.
+    """A builder of programs, step by step. Instead of a step equal to an earlier one, it reuses the earlier value.
 
     Args:
         program: the program to extend; by default an empty one.

@@ -38,7 +38,7 @@ def agree(actual: Tensor, expected: Tensor) -> bool:
 
 
 def agree_gradients(actual: Sequence[Tensor], expected: Sequence[Tensor]) -> bool:
-    """Returns whether two ways to compute gradients agree.
+    """Returns whether two computations of the same gradients agree.
 
     It compares norms of whole tensors, with ten times the tolerance of values: at the kink of a ReLU, rounding decides
     on which side a sample falls, and single entries of a gradient jump. A gradient that is zero up to rounding is

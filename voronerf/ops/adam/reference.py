@@ -59,7 +59,7 @@ class Guard(NamedTuple):
 
     @staticmethod
     def on(device: torch.device | str) -> Guard:
-        """Returns a guard that has skipped no steps."""
+        """Returns a new guard on a device, with no skipped steps."""
         skip, skipped, in_a_row = (torch.zeros((), dtype=torch.float32, device=device) for _ in range(3))
         return Guard(skip, skipped, in_a_row)
 

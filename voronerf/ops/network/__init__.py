@@ -160,7 +160,7 @@ class Network:
         backend: str = "auto",
         dtype: torch.dtype | None = None,
     ) -> tuple[list[Tensor], Tensor | None]:
-        """Evaluates tensors that have been checked; see :meth:`__call__`. By default, :meth:`dtype` is the dtype."""
+        """Evaluates tensors that have been checked; see :meth:`__call__`. Results have :meth:`dtype` by default."""
         dtype = dtype or self.dtype(inputs)
         run = backends.resolve(OP, backend=backend, device=inputs[0].device, dtype=dtype)
         rows = cells.sort(inputs[0], self.count(cells), backend)

@@ -91,7 +91,7 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
     k: int | None = None
 
     def to_check(self, op: str) -> Others:
-        """Checks the combination of arguments; returns the rules for the tensors, and the tensors."""
+        """Checks which arguments were passed together; returns the tensors' rules (shapes, dtypes), and the tensors."""
         if self.offsets is None and self.order is not None:
             raise ValueError(f"{op}: order must come with offsets, got no offsets")
         if self.offsets is not None:
@@ -125,12 +125,12 @@ offsets=tensor([0, 1, 3], dtype=torch.int32))
         return [rules[name] for name in given], [values[name] for name in given]
 
     def check(self, op: str, positions: Tensor, sizes: dict[str, int]) -> None:
-        """Checks the rules that depend on the sizes of the letters in the checked shapes.
+        """Raises ValueError if an argument does not fit the number of cells or the positions.
 
         Args:
             op: the name of the operation for error messages.
             positions: [n, w], the first input; its first three columns are the coordinates, unless they are given.
-            sizes: the size of each letter.
+            sizes: the size of each dimension by its letter, such as "k" for the number of cells.
         """
         if self.cells is not None:
             check_range(op, "cells", self.cells, sizes["k"])

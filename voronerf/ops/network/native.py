@@ -326,7 +326,7 @@ def _results_of(outputs: list[Tensor], sums: list[Tensor]) -> native.compiled.Pr
 
 @functools.lru_cache(maxsize=1024)
 def _code(text: str, layout: str, device: torch.device) -> Tensor:
-    """Returns the records of a program on a device, cached."""
+    """Returns a program as kernels read it, uint8 on a device; cached."""
     program = lower(text, layout, True).program
     code = torch.empty(native.compiled.program_code_bytes(program), dtype=torch.uint8, device="cpu")
     native.compiled.program_code(program, code)
