@@ -204,9 +204,7 @@ def train_group(group: Sequence[Run], scene: Scene, settings: Settings, say: Cal
         if batches is not None and not resume:
             training.state.strategy.reservoir = SampleReservoir(RESERVOIR, batches)
         trainings[run.folder] = training
-    lpips, source = find_lpips(None, group[0].config.data, scene.test.cameras.smallest[::-1])
-    if lpips is None:
-        say(source)
+    lpips = find_lpips(None, group[0].config.data, scene.test.cameras.smallest[::-1])
 
     def failed(training: Training, error: Exception) -> None:
         """Writes the error of a failed training in place of its result."""

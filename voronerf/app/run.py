@@ -104,8 +104,8 @@ class Run:
             raise IndexError(f"render: there are {len(cameras)} cameras, got number {index}")
         return render_camera(self.renderer, self.scene, cameras, index, heaviest=heaviest)
 
-    def find_lpips(self, weights: Path | str | None = None) -> tuple[Lpips | None, str]:
-        """Returns the LPIPS network for the images of this run, or None, and a line on its source or its absence.
+    def find_lpips(self, weights: Path | str | None = None) -> Lpips | None:
+        """Returns the LPIPS network for the images of this run, or None without weights or for images too small for it.
 
         Args:
             weights: A file or folder of weights, or "off"; None searches as in training, see ``TrainConfig.lpips``.
@@ -131,7 +131,7 @@ class Run:
             view.
         """
         if not isinstance(lpips, Lpips):
-            lpips, _ = self.find_lpips(lpips)
+            lpips = self.find_lpips(lpips)
         scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, track=track)
         return {**mean_scores(scores), "views": [asdict(score) for score in scores]}
 

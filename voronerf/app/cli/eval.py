@@ -11,6 +11,7 @@ from rich.table import Table
 from voronerf.app.cli.display import console, printable, say, tracked
 from voronerf.app.cli.opening import AS_IN_TRAINING, Opening, check_counts
 from voronerf.app.evaluate.angles import FAR_ANGLE
+from voronerf.app.evaluate.lpips import OFF
 from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.files import json_text, write_text
 from voronerf.app.train.config import ConfigError
@@ -39,9 +40,9 @@ def evaluate_run(
         raise ConfigError(f"--panels must not be negative, got {panels}")
     check_counts(views=views)
     opened = opening.open(run)
-    metric, source = opened.find_lpips(lpips)
-    if metric is None:
-        say(source)
+    metric = opened.find_lpips(lpips)
+    if metric is None and str(lpips or opened.config.lpips) != OFF:
+        say("LPIPS is not computed: docs/metrics.md tells what it needs")
     result = opened.evaluate(views=views, lpips=metric or "off", track=tracked)
     table = Table("view", "PSNR, dB", "SSIM", "LPIPS", "angle")
     for view in result["views"]:

@@ -334,9 +334,7 @@ def run_training(
             state = build(config, scene, on_event=display.on_event, speed=speed, ranks=ranks)
             if checkpoint is not None:
                 load(state, checkpoint)
-            lpips, source = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
-            if lpips is None:
-                display.on_event(source)
+            lpips = find_lpips(config.lpips, config.data, scene.test.cameras.smallest[::-1])
             if config.occupancy and not state.config.occupancy:
                 obstacle = why_no_occupancy(state.config) or "a scene without a box"
                 display.on_event(f"every sample is evaluated, also in empty space: no occupancy grid with {obstacle}")

@@ -100,10 +100,8 @@ class Lpips:
         return distance
 
 
-def find_lpips(
-    setting: Path | None, data: str = "", size: tuple[int, int] = (SMALLEST, SMALLEST)
-) -> tuple[Lpips | None, str]:
-    """Finds LPIPS weights on this machine and returns the metric.
+def find_lpips(setting: Path | None, data: str = "", size: tuple[int, int] = (SMALLEST, SMALLEST)) -> Lpips | None:
+    """Finds LPIPS weights on this machine and returns the metric, or None if there are no weights.
 
     The function looks for weights in this order: `setting`, VORONERF_LPIPS, the folder `lpips` of VORONERF_DATA, the
     folder `lpips` beside the folder of the scene, and the installed `lpips` package with the AlexNet that torchvision
@@ -112,11 +110,7 @@ def find_lpips(
     Args:
         setting: a file, or a folder of files; "off" for no LPIPS.
         data: the folder of the scene.
-        size: rows and columns of the images. LPIPS is skipped for images that are too small, unless `setting` is
-            given.
-
-    Returns:
-        The metric or None, and a line with the source of the weights or the reason why there are none.
+        size: rows and columns of the images. There is no LPIPS of images that are too small.
 
     Raises:
         LpipsError: the first weights that exist cannot be used, or the images are too small for the weights of
@@ -125,30 +119,29 @@ def find_lpips(
     Examples:
         >>> from pathlib import Path
         >>> from voronerf.app.evaluate import find_lpips
-        >>> lpips, source = find_lpips(Path("off"))
-        >>> lpips, source
-        (None, 'LPIPS is off')
+        >>> find_lpips(Path("off")) is None
+        True
     """
     named = str(setting or os.environ.get(VARIABLE, ""))
     if named == OFF:
-        return None, "LPIPS is off"
+        return None
     path = Path(os.path.expanduser(named))  # keeps ~ if nothing tells the home folder
     if named and not path.exists():
         raise LpipsError(f"{path}: there is no such file or folder, as set by {'--lpips' if setting else VARIABLE}")
     if min(size) < SMALLEST:
-        why = f"images of {size[0]} x {size[1]} are below AlexNet's smallest, {SMALLEST} x {SMALLEST}"
         if setting:
+            why = f"images of {size[0]} x {size[1]} are below AlexNet's smallest, {SMALLEST} x {SMALLEST}"
             raise LpipsError(f"--lpips must be {OFF} or come with larger images: {why}")
-        return None, f"LPIPS is not computed, {why}"
+        return None
     if named:
-        return Lpips(read_weights(_files(path))), f"LPIPS weights from {path}"
+        return Lpips(read_weights(_files(path)))
     folders = [Path(root) / "lpips" for root in (os.environ.get("VORONERF_DATA"),) if root]
     if data and Path(data).exists():
         place = Path(data).resolve()  # the scene's folder, or a file in it
         folders.append((place if place.is_dir() else place.parent).parent / "lpips")
     for folder in folders:
         if any(file.suffix in SUFFIXES for file in folder.glob("*")):
-            return Lpips(read_weights(_files(folder))), f"LPIPS weights from {folder}"
+            return Lpips(read_weights(_files(folder)))
     return _from_package()
 
 
@@ -199,20 +192,14 @@ def _files(path: Path) -> list[Path]:
     return [file for file in files if "alex" in file.name.lower()] or files
 
 
-def _from_package() -> tuple[Lpips | None, str]:
-    """Returns LPIPS with the weights of the installed `lpips` package; never downloads."""
+def _from_package() -> Lpips | None:
+    """Returns LPIPS with the weights of the installed `lpips` package, or None; never downloads."""
     package = importlib.util.find_spec("lpips")
-    ask = f"pass --lpips FILE or set {VARIABLE}"
     if package is None or not package.submodule_search_locations:
-        return None, f"LPIPS is not computed, no weights were found: {ask}"
+        return None
     linear = Path(next(iter(package.submodule_search_locations))) / "weights" / "v0.1" / "alex.pth"
-    alexnet = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET
-    absent = next((file for file in (linear, alexnet) if not file.is_file()), None)
-    if absent is not None:
-        return None, (
-            f"LPIPS is not computed, the lpips package lacks {absent}: {ask}, or call lpips.LPIPS(net='alex') once"
-        )
-    return Lpips(read_weights([linear, alexnet])), f"LPIPS weights from the lpips package and {alexnet}"
+    files = [linear, Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET]
+    return Lpips(read_weights(files)) if all(file.is_file() for file in files) else None
 
 
 def _first_line(error: Exception) -> str:
