@@ -14,6 +14,7 @@ from PIL import Image
 from scene_files import write_capture
 
 from voronerf.app.cli import info, main, train
+from voronerf.app.cli.compare import shown, written
 from voronerf.app.evaluate.panels import picture_of_colour
 from voronerf.app.run import open_run
 from voronerf.app.train.config import TrainConfig
@@ -38,10 +39,35 @@ def test_runs_are_compared(tmp_path, capsys):
     runs = make_run(tmp_path / "a[b]", 30.125, [16]), make_run(tmp_path / "wide", 31.5, [4, 4], ended=False)
     assert main(words("compare", *runs)) == 0
     rows = [line.split() for line in capsys.readouterr().out.replace("│", " ").splitlines()]
-    assert (
-        ["PSNR", "[dB]", "30.12", "31.50"] in rows and ["SSIM", "0.9000", "-"] in rows and ["LPIPS", "-", "-"] in rows
-    )
+    assert ["PSNR", "[dB]", "30.12", "31.50"] in rows and ["SSIM", "0.900", "-"] in rows and ["LPIPS", "-", "-"] in rows
     assert not any(row[0] in ("width", "out") for row in rows if row) and any(row[:1] == ["cells"] for row in rows)
+
+
+def test_numbers_are_compared_as_people_write_them(tmp_path, capsys):
+    short, long = make_run(tmp_path / "short", 30.125, [16]), make_run(tmp_path / "long", 27.5, [4, 4])
+    given = {
+        short: (
+            {"seconds": 4.6075, "steps": 1234},
+            {"lr": 1e-5, "budget": None, "field_options": ["finest=42", "x=1"]},
+        ),
+        long: (
+            {"seconds": 479.8, "steps": 99},
+            {"lr": 0.1 + 0.2, "budget": 1e6, "field_options": ["finest=107", "x=1"]},
+        ),
+    }
+    for run, changes in given.items():
+        for name, change in zip(("summary.json", "config.json"), changes):
+            (run / name).write_text(json.dumps(json.loads((run / name).read_text()) | change))
+    assert main(words("compare", short, long)) == 0
+    cells = [line.strip("│").split("│") for line in capsys.readouterr().out.splitlines() if line.startswith("│")]
+    rows = [[cell.strip() for cell in row] for row in cells]
+    assert ["training", "4.6 s", "8 min"] in rows and ["steps", "1,234", "99"] in rows
+    assert rows[-4:] == [
+        ["cells", "16", "4 4"],
+        *(["lr", "0.00001", "0.3"], ["budget", "-", "1,000,000"], ["finest", "42", "107"]),
+    ]
+    assert [shown(seconds, None) for seconds in (0.25, 59.4, 59.6, 90)] == ["0.25 s", "59 s", "1 min", "1 min 30 s"]
+    assert [written(value) for value in (True, [], "off")] == ["yes", "none", "off"]
 
 
 def test_scores_of_parts_of_views_are_marked(tmp_path, capsys):
@@ -52,7 +78,7 @@ def test_scores_of_parts_of_views_are_marked(tmp_path, capsys):
     assert main(words("compare", short, long)) == 0
     shown = capsys.readouterr().out
     rows = [line.split() for line in shown.replace("│", " ").splitlines()]
-    assert ["PSNR", "[dB]", "30.12*", "27.50"] in rows and ["SSIM", "0.9000*", "0.9000"] in rows
+    assert ["PSNR", "[dB]", "30.12*", "27.50"] in rows and ["SSIM", "0.900*", "0.900"] in rows
     assert "the middle 6% of 1 view" in shown and "3 views" in shown
     (short / "metrics.jsonl").write_text(
         '{"step": 1, "seconds": 1, "psnr": 20.0, "part": 1}\n{"step": 2, "seconds": 2, "psnr": 30.0, "part": 0.06}\n'
@@ -75,7 +101,7 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
     figures, shown = rows()
     count = json.loads((one / "summary.json").read_text())["parameters"]
     assert figures["cells"] == ["3", "6"] and figures["parameters"] == [f"{count:,}"] * 2  # one network, placed twice
-    assert figures["PSNR [dB]"][1] == figures["scores of"][1] == figures["training [s]"][1] == "-"
+    assert figures["PSNR [dB]"][1] == figures["scores of"][1] == figures["training"][1] == "-"
     assert f"{joined} has no scores: voronerf eval '{joined}' computes them" in shown and f"{one} has" not in shown
     assert main(words("eval --views 3 --panels 0", joined)) == 0
     psnr = json.loads((joined / "eval.json").read_text())["psnr"]

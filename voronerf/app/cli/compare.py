@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ from voronerf.app.cli.display import console, printable, say
 from voronerf.app.files import read_json
 from voronerf.app.train.callbacks import views_of
 from voronerf.app.train.checkpoint import last_checkpoint, no_run
-from voronerf.app.train.config import ConfigError
+from voronerf.app.train.config import ConfigError, parse_option
 from voronerf.app.train.run_directory import check_folders, read_metrics
 from voronerf.editing.run import has_parts, is_cut, open_parts
 
-#: Rows of the table: the name in summary.json, the heading, and the decimals.
+#: Rows of the table: the name in summary.json, the heading, and the decimals; None for a time.
 FIGURES = (
-    *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training [s]", 0)),
-    *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 4), ("lpips", "LPIPS", 4)),
+    *(("cells", "cells", 0), ("parameters", "parameters", 0), ("steps", "steps", 0), ("seconds", "training", None)),
+    *(("rays_per_second", "rays/s", 0), ("psnr", "PSNR [dB]", 2), ("ssim", "SSIM", 3), ("lpips", "LPIPS", 3)),
 )
 #: Scores of test views, and the mark of scores that were computed only on the central part of each view.
 SCORES, PARTLY = ("psnr", "ssim", "lpips"), "*"
@@ -53,7 +54,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
     table.add_row("scores of", *(", ".join(filter(None, words)) or "-" for words in viewed))
     table.add_section()
     for name in dict.fromkeys(name for _, settings in read for name in settings if name not in PLACES):
-        values = [escape(printable(str(settings.get(name)))) for _, settings in read]
+        values = [escape(printable(written(settings.get(name)))) for _, settings in read]
         if len(set(values)) > 1:
             table.add_row(escape(printable(name)), *values)
     console.print(table)
@@ -64,7 +65,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
 
 
 def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns the figures and the settings of a run.
+    """Returns the figures and the settings of a run, among them the options of its field.
 
     Raises:
         ConfigError: There is no run, or one of its folders is a link to elsewhere.
@@ -82,7 +83,8 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         figures = count_parts(run)
     if "psnr" not in figures and isinstance(views := scores.get("views"), list):
         figures |= {**scores, "views": len(views)}
-    return figures, settings
+    options = settings.pop("field_options", [])
+    return figures, settings | dict(parse_option(str(text)) for text in (options if isinstance(options, list) else []))
 
 
 def count_parts(run: Path) -> dict[str, Any]:
@@ -93,6 +95,22 @@ def count_parts(run: Path) -> dict[str, Any]:
     return {"cells": parts.num_cells, "parameters": sum(sizes)}
 
 
-def shown(value: object, places: int) -> str:
-    """Formats a number for the table; anything else becomes a dash."""
-    return f"{value:,.{places}f}" if isinstance(value, int | float) else "-"
+def shown(value: object, places: int | None) -> str:
+    """Formats a number, or a time in seconds without ``places``, for the table; anything else becomes a dash."""
+    if not isinstance(value, int | float):
+        return "-"
+    if places is not None:
+        return f"{value:,.{places}f}"
+    minutes, seconds = divmod(round(value), 60)
+    return f"{minutes} min" + f" {seconds} s" * (seconds > 0) if minutes else f"{value:.2g} s"
+
+
+def written(value: object) -> str:
+    """Returns a setting as people write it: 0.00001 for 1e-05, 4 4 for [4, 4], a dash for None."""
+    if isinstance(value, list | tuple):
+        return " ".join(map(written, value)) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int | float):
+        return f"{value:,}" if isinstance(value, int) else f"{Decimal(f'{value:.6g}'):,f}"
+    return "-" if value is None else str(value)
