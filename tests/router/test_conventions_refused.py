@@ -82,6 +82,42 @@ def test_modules_that_mix_samples_are_refused(number: int, centres: Tensor) -> N
         VoronoiRouter(module, centres, coords="first3")(uniform((40,) if number < len(MIXING) else (9, 7)))
 
 
+WIDE: list[Callable[[Any, Tensor], Any]] = [
+    lambda net, h: (torch.cdist(h, h),),
+    lambda net, h: (h, h @ h.T),
+    lambda net, h: (h[:, None] - h,),
+    lambda net, h: (h[:, torch.combinations(torch.arange(len(h))).sum(1) % 4],),  # n (n - 1) / 2 columns
+]
+
+
+@pytest.mark.parametrize("options", [{}, {"fuse": True}, {"way": "grouped"}, {"way": "loop"}], ids=str)
+@pytest.mark.parametrize("number", range(len(WIDE)))
+def test_results_as_wide_as_the_batch_are_refused(number: int, options: dict[str, Any], centres: Tensor) -> None:
+    """The sizes of the cells do not matter: equal cells would give results of equal width."""
+    rule = r"module must treat samples one by one, but Mixes.forward returns \[41, .*\] for 41 samples and \[37, "
+    for count in (4, 64):
+        equal = centres.repeat(count // 4, 1)
+        routers = [VoronoiRouter(Mixes(WIDE[number]), c, coords="first3", **options) for c in (centres, centres[:1])]
+        for router, x in ((routers[0], equal), (routers[0], uniform((count,))), (routers[1], equal)):
+            with pytest.raises(TypeError, match=rule):
+                router(x)
+        router = VoronoiRouter(Mixes(WIDE[number]), 4, **options)
+        for cells in (torch.arange(count) % 4, torch.arange(count) % 3):
+            with pytest.raises(TypeError, match=rule):
+                router(equal, cells=cells)
+
+
+def test_one_sample_may_share_arguments(centres: Tensor) -> None:
+    """Of one sample, nothing tells a table [1, f] from an argument per sample."""
+
+    class Table(nn.Linear):
+        def forward(self, x: Tensor, table: Tensor) -> Tensor:
+            return super().forward(x) @ table.T
+
+    router, table = VoronoiRouter(Table(3, 4), centres, coords="first3"), torch.randn(1, 4)
+    assert router(uniform((1,)), table).shape == (1, 1)
+
+
 class Field(nn.Module):
     """A field of features, and of optional further features per sample or per ray."""
 

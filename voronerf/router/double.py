@@ -29,7 +29,7 @@ _SEARCHED = 1000  # maximum number of searched objects in an attribute that is n
 
 
 class Forbidden(TypeError):
-    """An error for a method that changes the parameters of its module."""
+    """An error for a method that changes the parameters of its module, or whose results show that it mixes samples."""
 
 
 class Double:

@@ -124,8 +124,12 @@ class Probe:
         """
         call = self._call
         steps: Callable[[], list[CallAxes]] = self.steps
-        with contextlib.suppress(Exception):  # the result's ``why`` names the reason
+        try:
             steps = functools.partial(steps_of, self.note_changes(warn_once).runs, _COUNTS)
+        except Forbidden:
+            raise
+        except Exception:  # the result's ``why`` names the reason
+            pass
         for loop in (Loop(), Loop(again=True)):
             try:
                 expected = self._outcome(loop)
@@ -234,10 +238,18 @@ class Probe:
         return recording
 
     def _note_numbers(self, recording: ProbeRuns, warn_once: Callable[[str, str], None]) -> None:
-        """Finds the results that count samples; warns of other numbers, which a call cannot follow."""
+        """Finds the results that count samples; warns of other numbers, which a call cannot follow.
+
+        Raises Forbidden for results whose width depends on the number of samples.
+        """
         name, (ours, theirs), counts = self._call.name, recording.leaves, dict[str, int]()
         for key, number in ours.items():
             other: Any = theirs.get(key)
+            shapes = [leaf.shape for leaf in (number, other) if isinstance(leaf, Tensor)]
+            # A call of one sample mixes nothing, and its arguments [1, f] may be shared.
+            if len({shape[1:] for shape in shapes}) > 1 and self._source[0].layout.n > 1:
+                widths = " and ".join(f"{list(shape)} for {n} samples" for shape, n in zip(shapes, _COUNTS))
+                raise Forbidden(f"{_OP}: module must treat samples one by one, but {name} returns {widths}")
             if type(number) not in (int, float) or type(other) is not type(number) or number == other:
                 continue
             m = multiple((number, other), _COUNTS) if type(number) is int and len(self._call.layout.lead) == 1 else 0
