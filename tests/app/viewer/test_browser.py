@@ -75,14 +75,12 @@ def wide(camera, view):
     return camera if sees >= 0.99 * view.width / view.intrinsics[0, 0] else None
 
 
-def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser) -> None:
+def test_a_phone_folds_the_panel_below_all_of_the_scene(run, served, browser) -> None:
     metrics = {"width": 390, "height": 844, "deviceScaleFactor": 3, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     browser.get(served.address)
     client = until(lambda: next(iter(served.clients.values()), None))
     body = browser.find_element("tag name", "body")
-    until(lambda: re.search(r"\d+ x 128 pixels in \d+\.\d\d s", body.text))
-    assert "Drag: turn." in body.text and "Click or tap a cell." in body.text  # the first panel folder is open
 
     def seen(part):
         """Returns an element's [left, top, right, bottom], or None if it is covered or partly outside the window."""
@@ -94,17 +92,16 @@ def test_a_phone_has_the_panel_beside_all_of_the_scene(run, served, browser) -> 
         )
         return at if at and at[0] >= 0 and at[1] > 844 / 3 and at[2] <= 390 and at[3] <= 844 else None
 
-    show = browser.find_element("css selector", "input[value='colour']")
-    until(lambda: seen(show))
+    show = until(lambda: browser.find_elements("css selector", "input[value='colour']"))[0]
+    title = browser.find_element("xpath", f"//*[text()='{served.subject.name}']")
+    assert until(lambda: seen(title))[1] > 844 - 110 and not seen(show)
     view = run.scene.test.cameras
     camera = until(lambda: wide(client.camera(128), view))
-
-    title = browser.find_element("xpath", f"//*[text()='{served.subject.name}']")
-    title.click()  # folds the panel
-    until(lambda: not seen(show))
     webdriver.ActionChains(browser).move_by_offset(195, 422).click().perform()
-    title.click()
-    until(lambda: f"of {run.diagram.num_cells}" in body.text)
+    browser.find_element("xpath", "//*[text()='Settings']").click()
+    until(lambda: seen(show))
+    until(lambda: re.search(r"\d+ x 128 pixels in \d+\.\d\d s", body.text))
+    assert "Drag: turn." in body.text and f"of {run.diagram.num_cells}" in body.text
     assert client.look.picked == cell_at(served.subject, camera, client.look, 0.5, 0.5)
     show.click()
     until(lambda: browser.find_elements("xpath", "//*[@role='option'][.='cells']"))[0].click()

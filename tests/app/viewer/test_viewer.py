@@ -117,6 +117,17 @@ def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> N
         again.close()
 
 
+def test_a_narrow_canvas_opens_with_folded_settings(viewer, scene, tab) -> None:
+    tab.until(lambda: "GuiUplotMessage" in tab.gui)
+    assert "Settings" not in tab.gui
+    with closing(Tab(viewer, scene.test.cameras, size=(39, 84), number=1)) as phone:
+        phone.until(lambda: "GuiUplotMessage" in phone.gui)
+        folder = phone.gui["Settings"]
+        assert folder["expand_by_default"] is False
+        inside = [label for label, part in phone.gui.items() if part["folder"] == folder["uuid"]]
+        assert {"Show", "Pixels", "Cells", "GuiUplotMessage"} <= set(inside)
+
+
 def test_a_slow_page_opens_at_all_of_the_first_view(viewer, scene) -> None:
     """A page that first sends viser's wider angle of view still opens with the viewer's angle."""
     before = replace(scene.test.cameras, intrinsics=scene.test.cameras.intrinsics / 2)

@@ -68,6 +68,7 @@ class Client:
         drawn_at: The time when the last sharp picture was done.
         cost: Seconds that the last sharp picture took.
         state: The line about the picture in the panel.
+        panel: The folder of all controls: closed on a canvas that is higher than wide, elsewhere without a header.
     """
 
     def __init__(self, handle: viser.ClientHandle, viewer: Viewer) -> None:
@@ -91,7 +92,10 @@ class Client:
         self.look = Look(level=diagram.depth, background="black" if scene.background is None else "white")
         self.nodes: dict[str, list[Any]] = {kind: [] for kind in ("centres", "cameras", "crop", "keyframes")}
         self.curve: viser.GuiUplotHandle | None = None
-        self._build()
+        # viser always opens the sheet of a phone, which would hide half of the picture.
+        self.panel = self.handle.gui.add_folder("Settings" if self.aspect < 1 else None, expand_by_default=False)
+        with self.panel:
+            self._build()
         self.draw_curve()
 
     def on_subject(self) -> None:
@@ -235,9 +239,10 @@ class Client:
             self.curve.data = (seconds, psnr)
             return
         series = (Series(label="s"), Series(label="PSNR [dB]", stroke="#00897b", width=2))
-        self.curve = self.handle.gui.add_uplot(
-            (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=1e9
-        )
+        with self.panel:
+            self.curve = self.handle.gui.add_uplot(
+                (seconds, psnr), series, scales={"x": Scale(time=False)}, aspect=1.8, padding=PADDING, order=1e9
+            )
 
     def on(self, register: Callable[[Callable[[Any], None]], object], work: Callable[[], object]) -> None:
         """Registers ``work`` as the callback of a panel element; if it fails, the client is disconnected."""
