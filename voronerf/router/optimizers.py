@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
+#: Names of optimisers' state tensors that hold means or sums of gradients, or of their squares.
+MOMENTS = ("exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "grad_avg", "square_avg", "sum")
 PATIENCE = 64  # calls before a check ends; gradient accumulation makes several calls per step
 
 
@@ -27,9 +29,13 @@ def check_optimizer(optimizer: torch.optim.Optimizer | None, module: nn.Module, 
 
 
 def move_state(
-    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, fresh: Tensor | None
+    optimizer: torch.optim.Optimizer, module: nn.Module, parents: Tensor, k: int, shares: Tensor, fresh: Tensor | None
 ) -> None:
     """Gives every new cell its parent's optimiser state.
+
+    The n children of a cell share its samples: the mean of their gradients is about 1/n of the parent's, and so is the
+    variance. Moments of gradients and of squares are therefore divided by n. Otherwise Adam would make up to n times
+    shorter steps until it has forgotten the parent's gradients, for a thousand steps with beta2 = 0.999.
 
     The parameters have their new shapes already. If any state tensor does not have one row per cell, all state is
     reset.
@@ -39,6 +45,7 @@ def move_state(
         module: The routed module.
         parents: The parent of each new cell among the k old cells, int64 [new cells].
         k: The number of old cells.
+        shares: The number n of cells that share the samples of each new cell's parent, int64 [new cells].
         fresh: The mask of new cells whose state becomes 0, bool [new cells]; None for no cells.
     """
     is_reset = False
@@ -47,6 +54,8 @@ def move_state(
         for key, value in state.items():
             if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
                 state[key] = value[parents.to(value.device)]
+                if key in MOMENTS:
+                    state[key] /= shares.to(value).view(-1, *[1] * (value.dim() - 1))
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
             else:

@@ -415,9 +415,10 @@ class VoronoiRouter(nn.Module):
         """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
 
         Parameters are copied from the parent. With ``optimizer``, the state of Adam, AdamW, RAdam, SGD and similar
-        optimisers is copied too; the state of other optimisers is reset, with a warning. The parameter objects stay the
-        same, so groups, learning rates and schedules continue. A wrapper with parameters of its own, such as
-        ``DistributedDataParallel``, must be made again.
+        optimisers is copied too, and moments are divided by the number of children, which share the parent's samples.
+        The state of other optimisers is reset, with a warning. The parameter objects stay the same, so groups, learning
+        rates and schedules continue. A wrapper with parameters of its own, such as ``DistributedDataParallel``, must be
+        made again.
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
@@ -462,7 +463,8 @@ class VoronoiRouter(nn.Module):
             raise ValueError("VoronoiRouter.subdivide: diagram must have centres like the router's, got none")
         finer, parents = finer_diagram(self.diagram, diagram, parents, points, weights, split)
         # Marks the children of split cells. Other cells keep their values, with or without inheritance.
-        new = torch.bincount(parents, minlength=k)[parents] > 1
+        children = torch.bincount(parents, minlength=k)[parents]
+        new = children > 1
         fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
         renew_cells(self.module, parents, fresh, new)
         self.diagram, self._positions_unchecked = copy.deepcopy(finer).to(self.diagram.centres.device), True
@@ -470,7 +472,8 @@ class VoronoiRouter(nn.Module):
         if self.frozen_cells is not None:
             self._set_frozen(self.frozen_cells[parents.to(self.frozen_cells.device)])
         if optimizer is not None:
-            move_state(optimizer, self.module, parents, k, None if fresh is None else new)
+            shares = children if self._d else torch.ones_like(children)  # labels have samples of their own
+            move_state(optimizer, self.module, parents, k, shares, None if fresh is None else new)
         else:
             self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
         return parents
