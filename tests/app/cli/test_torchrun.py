@@ -50,6 +50,7 @@ def children(process):
     return [int(line) for line in listed.stdout.split()]
 
 
+@pytest.mark.slow
 @several
 def test_another_number_of_processes_continues_a_run(tmp_path):
     assert main(words("train --data builtin --out", tmp_path, TINY)) == 0
@@ -64,6 +65,7 @@ def test_another_number_of_processes_continues_a_run(tmp_path):
     assert read_json(tmp_path / "summary.json")["steps"] == 48
 
 
+@pytest.mark.slow
 @several
 def test_a_killed_process_ends_all_and_a_restart_goes_on(tmp_path):
     endless = TINY.replace("--steps 16", "--steps 1600 --checkpoint-every 0.2 --panels 0")
