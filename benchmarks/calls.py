@@ -3,9 +3,9 @@
     python benchmarks/calls.py --json benchmarks/results/calls.json
 
 Ops: the public Python function and, for ``nearest_centre``, the C++ function that it calls. Routers: 16 cells with
-``fuse=True``, compared with one ``nn.Sequential`` and with routing by hand (argmin, argsort, one padded ``baddbmm`` per
-layer, scatter). Networks on sorted rows: ``grouped_mlp``, compared with a padded ``baddbmm``. Times are median wall
-times in microseconds.
+``fuse=True``, compared with one such cell, one ``nn.Sequential`` and routing by hand (argmin, argsort, one padded
+``baddbmm`` per layer, scatter). Networks on sorted rows: ``grouped_mlp``, compared with a padded ``baddbmm``. Times are
+median wall times in microseconds.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
     }
     for n in (16, 256, 4096, 65536):
         plain, x = network(), torch.rand(n, 3)
-        router = VoronoiRouter(network(), torch.rand(CELLS, 3), coords="first3", fuse=True)
+        router, one = (VoronoiRouter(network(), torch.rand(k, 3), coords="first3", fuse=True) for k in (CELLS, 1))
         linears = [layer for layer in router.module if isinstance(layer, nn.Linear)]
         layers = [
             (copy.deepcopy(linear.weight).mT.detach().requires_grad_(), copy.deepcopy(linear.bias)[:, None].detach())
@@ -87,6 +87,7 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
         ]
         ways: dict[str, Callable[[], Tensor]] = {
             "router": lambda router=router, x=x: router(x),
+            "one cell": lambda one=one, x=x: one(x),
             "nn.Sequential": lambda plain=plain, x=x: plain(x),
             "by hand": lambda router=router, x=x, layers=layers: by_hand(x, router.diagram.centres, layers),
         }

@@ -9,6 +9,7 @@ rate falls over the whole training. Trainings that the JSON file has are not rep
 
 from __future__ import annotations
 
+import itertools
 import json
 import tempfile
 import time
@@ -119,30 +120,39 @@ def plot(path: Path, results: Sequence[dict[str, Any]]) -> None:
     figure.savefig(path, dpi=110)
 
 
+def by_side(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns for each side, scene and length the means over the seeds of PSNR, steps and milliseconds of a picture."""
+    found: list[dict[str, Any]] = []
+    for side in SIDES:
+        result: dict[str, Any] = {"side": side}
+        for scene, minutes in dict.fromkeys((row["scene"], row["minutes"]) for row in rows):
+            group = [row for row in rows if (row["scene"], row["minutes"], row["side"]) == (scene, minutes, side)]
+            if group:
+                means = {name: sum(row[name] for row in group) / len(group) for name in ("psnr", "steps", "picture_ms")}
+                result.setdefault(scene, {})[f"{minutes:g} min"] = {**means, "seeds": len(group)}
+        found.append(result)
+    return found
+
+
 def main(options: Options) -> None:
     """Trains what is missing, writes the results after every length, and draws them."""
     torch.set_num_threads(1)
-    stored = (
-        json.loads(options.json.read_text())
-        if options.json.exists()
-        else metadata(benchmark="cells_over_time", views=options.views, field="nerf", results=[])
-    )
-    results: list[dict[str, Any]] = stored["results"]
-    for minutes in options.minutes:
-        for data in options.data:
-            for seed in options.seeds:
-                there = {
-                    row["side"]
-                    for row in results
-                    if (row["scene"], row["minutes"], row["seed"]) == (Path(data).name, minutes, seed)
-                }
-                missing = [side for side in options.sides if side not in there and SIDES[side][1] <= minutes]
-                if missing:
-                    results += train(data, minutes, seed, missing, options.views)
-                    write_text(options.json, json_text(stored))
-                    print(f"{minutes:g} minutes of {data}, seed {seed}", flush=True)
+    if options.json.exists():
+        stored = json.loads(options.json.read_text())
+    else:
+        stored = metadata(benchmark="cells_over_time", views=options.views, field="nerf", results={"trainings": []})
+    rows: list[dict[str, Any]] = stored["results"]["trainings"]
+    for minutes, data, seed in itertools.product(options.minutes, options.data, options.seeds):
+        this = Path(data).name, minutes, seed
+        there = {row["side"] for row in rows if (row["scene"], row["minutes"], row["seed"]) == this}
+        missing = [side for side in options.sides if side not in there and SIDES[side][1] <= minutes]
+        if missing:
+            rows += train(data, minutes, seed, missing, options.views)
+            stored["results"]["sides"] = by_side(rows)
+            write_text(options.json, json_text(stored))
+            print(f"{minutes:g} minutes of {data}, seed {seed}", flush=True)
     if options.plot is not None:
-        plot(options.plot, results)
+        plot(options.plot, rows)
 
 
 if __name__ == "__main__":

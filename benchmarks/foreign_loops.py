@@ -1,4 +1,4 @@
-"""Trains fields of other codebases in their own training loops: unchanged, narrower, routed, or in a loop over masks.
+"""Trains fields of other codebases in their own training loops: unchanged, narrower, fused, in cells, or by masks.
 
 Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch must be in one folder,
 and the scenes in VORONERF_DATA. A loop ends after --seconds of processor time. Mocks replace packages that the clones
@@ -27,6 +27,7 @@ import torch
 from harness import metadata
 from PIL import Image
 from torch import Tensor, nn
+from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 from voronerf.app.scenes import load_scene
@@ -66,19 +67,43 @@ class Run:
     def __init__(self, way: str, seconds: float, clones: Path) -> None:
         self.way, self.seconds, self.clones, self.steps = way, seconds, clones, -1
 
-    def field(self, make: Callable[[bool], nn.Module], points: Tensor) -> nn.Module:
+    def field(
+        self, make: Callable[[bool], nn.Module], points: Tensor, weights: Callable[[Tensor], Tensor] | None = None
+    ) -> nn.Module:
         """Returns the field to train, and counts its calls as steps.
 
-        The way "plain" trains the original field ``make(True)``, and "narrow" trains a narrower field ``make(False)``.
-        The ways "routed" and "masks" train one narrower field per cell, in a router or in a loop over masks. The cells'
-        centres are computed from the samples ``points`` [..., d].
+        The way "plain" trains the original field ``make(True)``. All other ways train narrower fields ``make(False)``:
+        "narrow" one in PyTorch, "fused" one in a router of one cell, "split" (as published) this router, which is
+        subdivided after a fifth of the time, "routed" a router with all cells from the start, and "masks" the same
+        cells in a loop over masks. The cells' centres are computed from the samples ``points`` [..., d] or, for
+        "split", from the samples of the last step and from ``weights`` of their results.
         """
-        net = make(self.way == "plain")
+        net, dim = make(self.way == "plain"), points.shape[-1]
+        if self.way in ("fused", "split"):
+            net = VoronoiRouter(net, torch.zeros(1, dim), coords=f"first{dim}", fuse=True)
         if self.way in ("masks", "routed"):
             diagram = VoronoiDiagram.from_points(points, CELLS, generator=torch.Generator().manual_seed(0))
-            net = VoronoiRouter(net, diagram, coords=f"first{points.shape[-1]}", fuse=True)
+            net = VoronoiRouter(net, diagram, coords=f"first{dim}", fuse=True)
             net = Masks([net.cell(i) for i in range(CELLS)], diagram) if self.way == "masks" else net
-        self.began = time.process_time()
+        self.began, waiting = time.process_time(), self.way == "split"
+
+        def split(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+            nonlocal waiting
+            if waiting and time.process_time() - self.began > self.seconds / 5:
+                waiting, (x, results) = False, last
+                chosen = None if weights is None else weights(results).flatten()
+                torch.manual_seed(0)
+                net.subdivide(CELLS, optimizer=optimizer, points=x[..., :dim].reshape(-1, dim), weights=chosen)
+
+        def keep(module: nn.Module, arguments: tuple[Tensor, ...], results: Tensor) -> None:
+            nonlocal last
+            if torch.is_grad_enabled():
+                last = arguments[0].detach(), results.detach()
+
+        last: Any = None
+        if waiting:
+            net.register_forward_hook(keep)
+            register_optimizer_step_post_hook(split)
         net.register_forward_pre_hook(lambda *_: self.step() if torch.is_grad_enabled() else None)
         return net
 
@@ -160,7 +185,10 @@ def nerf(run: Run) -> dict[str, float]:
     create, own, created = run_nerf.create_nerf, run_nerf.NeRF, list[Any]()
     loaded = images, poses, torch.zeros(1, 4, 4), [size, size, focal], (np.arange(100), test, test)
     run_nerf.load_blender_data = lambda *_: loaded
-    run_nerf.NeRF = lambda **keywords: run.field(lambda wide: own(**{**keywords, "W": 256 if wide else 64}), points)
+    density = lambda raw: torch.nn.functional.softplus(raw[..., 3])  # noqa: E731  positive where all is empty, too
+    run_nerf.NeRF = lambda **keywords: run.field(
+        lambda wide: own(**{**keywords, "W": 256 if wide else 64}), points, density
+    )
     run_nerf.create_nerf = lambda args: created.append(create(args)) or created[0]
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Done):
         sys.argv = [*NERF.split(), folder]
@@ -176,7 +204,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     loops = {"coin": (coin, "coin"), "flow": (flow, "Neural_Scene_Flow_Prior"), "nerf": (nerf, "nerf-pytorch")}
     parser.add_argument("loop", choices=loops)
-    parser.add_argument("way", choices=("plain", "narrow", "masks", "routed"))
+    parser.add_argument("way", choices=("plain", "narrow", "fused", "split", "routed", "masks"))
     parser.add_argument("clones", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -198,8 +226,30 @@ def main() -> None:
         "steps": run.steps,
     } | scores
     print(row)
-    stored = json.loads(options.json.read_text()) if options.json.exists() else {"metadata": metadata(), "results": []}
-    options.json.write_text(json.dumps({**stored, "results": [*stored["results"], row]}, indent=1))
+    stored = json.loads(options.json.read_text()) if options.json.exists() else {"metadata": metadata(), "results": {}}
+    rows = [*stored["results"].get("trainings", ()), row]
+    stored["results"] = {"trainings": rows, "over seeds": over_seeds(rows)}
+    options.json.write_text(json.dumps(stored, indent=1))
+
+
+def over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Returns for each loop and length the mean steps and the mean, least and greatest score of each way."""
+    tables: dict[tuple[str, float], dict[str, list[dict[str, Any]]]] = {}
+    for row in rows:
+        tables.setdefault((row["loop"], row["seconds"]), {}).setdefault(row["way"], []).append(row)
+    results = []
+    for (loop, seconds), ways in tables.items():
+        result: dict[str, Any] = {"loop": loop, "seconds": seconds}
+        for way, group in ways.items():
+            scores = [row["psnr"] if "psnr" in row else row["error"] for row in group]
+            result[way] = {
+                "steps": round(sum(row["steps"] for row in group) / len(group)),
+                "mean": sum(scores) / len(scores),
+                "least": min(scores),
+                "most": max(scores),
+            }
+        results.append(result)
+    return results
 
 
 if __name__ == "__main__":

@@ -108,7 +108,7 @@ def test_results_as_wide_as_the_batch_are_refused(number: int, options: dict[str
 
 
 def test_one_sample_may_share_arguments(centres: Tensor) -> None:
-    """Of one sample, nothing tells a table [1, f] from an argument per sample."""
+    """With one sample, a table [1, f] cannot be told from an argument per sample."""
 
     class Table(nn.Linear):
         def forward(self, x: Tensor, table: Tensor) -> Tensor:
