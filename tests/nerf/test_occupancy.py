@@ -320,6 +320,22 @@ def test_specks_are_dropped_and_thin_things_stay():
     assert torch.equal(grid.density, 3.0 * grid.occupied)
 
 
+def test_a_grid_that_is_mostly_full_at_the_end_is_emptied_by_its_field():
+    """A full grid makes pictures slow. A field that cannot tell empty space, and a box of dense things, stay as is."""
+
+    def fog(positions, directions, ray_index):
+        return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)
+
+    shares = []
+    for field, occupied in ((Ball(), 1.0), (fog, 1.0), (Ball(), 0.5)):
+        grid = OccupancyGrid(BOX, 16, threshold=1.0)
+        grid.density[int(16 * occupied) :] = grid.occupied[int(16 * occupied) :] = 0
+        Occupancy(grid, 8).finish(field, seed=0)
+        assert torch.equal(grid.occupied, grid.density >= grid.threshold)
+        shares.append(grid.share)
+    assert shares[0] < 0.2 and shares[1:] == [1.0, 0.5]
+
+
 def test_images_are_the_same_with_a_fraction_of_the_samples():
     dense, sparse = Ball(), Ball()
     options = {"near": 1.0, "far": 5.0, "box": BOX, "samples": 96, "background": WHITE}

@@ -19,6 +19,7 @@ from PIL import Image
 from scene_files import write_blender
 
 from voronerf.app.cli import main
+from voronerf.app.cli.demo import show
 from voronerf.app.cli.display import TrainingDisplay
 from voronerf.app.cli.program import COMMANDS
 from voronerf.app.export import space
@@ -248,6 +249,17 @@ def test_demo_shows_a_run_and_writes_over_none(tmp_path, capsys, monkeypatch, fa
     assert following.split()[0] in COMMANDS
     fails("--out must not hold a run already", "demo --out runs/demo")
     fails("budget must be a positive number", "demo --budget 0")
+
+
+def test_the_video_of_a_slow_field_has_fewer_frames(run, tmp_path, capsys, monkeypatch):
+    for name, value in (("SIZE", 16), ("FRAMES", 12), ("LONGEST", 1e-9)):
+        monkeypatch.setattr(f"voronerf.app.cli.demo.{name}", value)
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    show(copy, builtin_scene(16), read_json(copy / "summary.json"), 1.0)
+    assert "the video has 8 frames instead of 12, since a frame takes" in capsys.readouterr().out
+    reader = imageio_ffmpeg.read_frames(str(copy / "turn.mp4"))
+    assert next(reader)["fps"] == pytest.approx(16 * 8 / 12, abs=0.01) and len(list(reader)) == 8
 
 
 @pytest.mark.parametrize(("stop", "status"), [(KeyboardInterrupt(), 130), (SystemExit(143), 143)])

@@ -6,6 +6,7 @@ import importlib.util
 import shlex
 import shutil
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,8 @@ from voronerf.nerf.cameras import Cameras, orbit_cameras
 #: Pixels along a side of the images, the pictures and the video.
 SIZE = 400
 FRAMES, FPS = 48, 16
+#: The CPU time of the video in seconds above which a slow field gets fewer frames, but at least ``FEWEST``.
+LONGEST, FEWEST = 50.0, 8
 #: Position and scale of the small copy of the scene, which stands on the globe of the built-in scene.
 TOP, SCALE = (0.0, 0.0, 1.0), 0.35
 
@@ -61,10 +64,15 @@ def demo(out: Path | None = None, budget: float = 35.0) -> int:
 
 def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None:
     """Writes pictures, a video and a page into a trained run, and prints a line about each."""
-    opened, around = open_run(run, scene=scene), turn(FRAMES)
-    score = f"{scores['psnr']:.1f} dB after {budget:g} s"
-    save_picture(run / "turn.png", next(frames(opened, around, [FRAMES // 8], score)))
-    write_video(run / "turn.mp4", frames(opened, around, tracked(range(FRAMES), "the video"), score), FPS)
+    opened, score = open_run(run, scene=scene), f"{scores['psnr']:.1f} dB after {budget:g} s"
+    started = time.process_time()
+    save_picture(run / "turn.png", next(frames(opened, turn(FRAMES), [FRAMES // 8], score)))
+    seconds = time.process_time() - started
+    count = min(FRAMES, max(FEWEST, int(LONGEST / max(seconds, 1e-3))))
+    if count < FRAMES:
+        say(f"the video has {count} frames instead of {FRAMES}, since a frame takes {seconds:.1f} s of CPU time")
+    numbers = tracked(range(count), "the video")
+    write_video(run / "turn.mp4", frames(opened, turn(count), numbers, score), FPS * count / FRAMES)
     place(run, run, TOP, run / "placed", scale=SCALE)
     above = turn(FRAMES, height=0.3, distance=1.25)
     image = open_parts(run / "placed", scene=scene).render(above, FRAMES // 8, heaviest=False)
