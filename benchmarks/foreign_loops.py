@@ -1,8 +1,7 @@
 """Trains fields of other codebases in their own training loops: unchanged, narrower, fused, in cells, or by masks.
 
-Clones of EmilienDupont/coin, Lilac-Lee/Neural_Scene_Flow_Prior and yenchenlin/nerf-pytorch must be in one folder,
-and the scenes in VORONERF_DATA. A loop ends after --seconds of processor time. Mocks replace packages that the clones
-import (`ABSENT`).
+Clones of EmilienDupont/coin and yenchenlin/nerf-pytorch must be in one folder, and the scenes in VORONERF_DATA. A loop
+ends after --seconds of processor time. Mocks replace packages that the clones import (`ABSENT`).
 
     python benchmarks/foreign_loops.py coin routed CLONES --json FILE [--seconds 60] [--seed 0]
 """
@@ -31,10 +30,9 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from voronerf import VoronoiDiagram, VoronoiRouter
 from voronerf.app.scenes import load_scene
-from voronerf.app.scenes.colmap import read_model
 
 CELLS, DATA = 16, Path(os.environ.get("VORONERF_DATA", "data"))
-ABSENT = "cv2 imageio pandas open3d mayavi configargparse pytorch3d.ops.knn pytorch3d.structures.pointclouds visualize"
+ABSENT = "cv2 imageio configargparse"
 NERF = """run_nerf --expname x --dataset_type blender --datadir x --use_viewdirs --white_bkgd --no_batching
     --N_samples 64 --N_rand 256 --lrate_decay 500 --precrop_iters 100 --basedir"""
 
@@ -127,43 +125,6 @@ def coin(run: Run) -> dict[str, float]:
     return {"loss": min(trainer.logs["loss"]), "psnr": float(max(trainer.logs["psnr"]))}
 
 
-def nearest(x: Tensor, y: Tensor, **_: Any) -> Any:
-    """Replaces ``pytorch3d.ops.knn_points`` for K = 1: squared distances [1, n, 1] from points x to their nearest y."""
-    with torch.no_grad():
-        index = torch.cdist(x, y).argmin(2)
-    return mock.Mock(dists=(x - y[0][index[0]]).square().sum(-1, keepdim=True), idx=index[..., None])
-
-
-def flow(run: Run) -> dict[str, float]:
-    """Trains Neural Scene Flow Prior, width 128 or 64: flow from half of bonsai's points to the deformed other half."""
-    torch.Tensor.cuda = lambda self, *_, **__: self
-    sys.modules["pytorch3d.ops.knn"].knn_points = nearest
-    sys.modules["pytorch3d.structures.pointclouds"].Pointclouds = type(None)
-    import config
-    import model
-    import optimization
-
-    points = torch.from_numpy(read_model(DATA / "bonsai/sparse/0").points).float()
-    points -= points.median(0).values
-    points = points[points.norm(dim=1) < 4 * points.abs().median()] / points.abs().median()
-    points = points[torch.randperm(len(points), generator=(generator := torch.Generator().manual_seed(0)))[:4096]]
-    shift = 0.2 * torch.randn(8, 3, generator=generator)
-    true = torch.softmax(-8 * torch.cdist(points, points[:8]), 1) @ shift
-    config.add_config(parser := argparse.ArgumentParser())
-    options = parser.parse_args(["--early_patience", "0", "--iters", "1000000"])
-    net, seen = run.field(lambda own: model.Neural_Prior(filter_size=128 if own else 64), points[:2048]), list[float]()
-
-    def noted(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda *args: (found := function(*args), seen.append(float(found[0])))[0]
-
-    optimization.my_chamfer_fn = noted(optimization.my_chamfer_fn)
-    optimization.scene_flow_metrics = noted(optimization.scene_flow_metrics)
-    with contextlib.suppress(Done):
-        list(optimization.solver(points[None, :2048], (points + true)[None, 2048:], true[None, :2048], options, net, 0))
-    losses, errors = seen[::2], seen[1::2]  # end point errors
-    return {"loss": min(losses), "error": errors[int(np.argmin(losses))], "no_flow": float(true.norm(dim=1).mean())}
-
-
 def nerf(run: Run) -> dict[str, float]:
     """Runs nerf-pytorch's train() on Lego at 100 x 100: width 256 or 64, 256 rays of 64 samples a step."""
 
@@ -202,7 +163,7 @@ def nerf(run: Run) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    loops = {"coin": (coin, "coin"), "flow": (flow, "Neural_Scene_Flow_Prior"), "nerf": (nerf, "nerf-pytorch")}
+    loops = {"coin": (coin, "coin"), "nerf": (nerf, "nerf-pytorch")}
     parser.add_argument("loop", choices=loops)
     parser.add_argument("way", choices=("plain", "narrow", "fused", "split", "routed", "masks"))
     parser.add_argument("clones", type=Path)
@@ -210,9 +171,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, required=True, help="a file of rows, to which this one is added")
     options = parser.parse_args()
-    for name in [*ABSENT.split(), "data"]:
-        for part in (name.rsplit(".", i)[0] for i in range(name.count(".") + 1)):
-            sys.modules[part] = mock.MagicMock(__spec__=ModuleSpec(part, None))
+    for name in ABSENT.split():
+        sys.modules[name] = mock.MagicMock(__spec__=ModuleSpec(name, None))
     function, folder = loops[options.loop]
     sys.path.insert(0, str(options.clones / folder))
     torch.manual_seed(options.seed)
@@ -241,7 +201,7 @@ def over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for (loop, seconds), ways in tables.items():
         result: dict[str, Any] = {"loop": loop, "seconds": seconds}
         for way, group in ways.items():
-            scores = [row["psnr"] if "psnr" in row else row["error"] for row in group]
+            scores = [row["psnr"] for row in group]
             result[way] = {
                 "steps": round(sum(row["steps"] for row in group) / len(group)),
                 "mean": sum(scores) / len(scores),

@@ -15,7 +15,7 @@ from voronerf.router.grouping import cell_parameters
 
 _OP = "VoronoiRouter"
 #: Names of optimisers' state tensors that hold means or sums of gradients, or of their squares.
-MOMENTS = {"exp_avg", "exp_avg_sq", "max_exp_avg_sq", "momentum_buffer", "grad_avg", "square_avg", "sum"}
+MOMENTS = {"exp_avg", "exp_avg_sq", "max_exp_avg_sq", "exp_inf", "momentum_buffer", "grad_avg", "square_avg", "sum"}
 PATIENCE = 64  # calls before a check ends; gradient accumulation makes several calls per step
 
 
