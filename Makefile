@@ -11,6 +11,8 @@ TEST_ARGS ?=
 # Test cases are small: more threads than this wait for each other longer than they work. Some tests ask for their own,
 # and wait as they do for `voronerf`, without spinning beside the other processes.
 THREADS ?= 1
+# Tests start some fifty programs: without bytecode, each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 # Processes that share the tests.
 JOBS ?= auto
 # Every architecture nvcc 13 knows that a user may have; the last also as PTX.

@@ -206,6 +206,14 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _freeze() -> Iterator[None]:
+    """Excludes what a file of tests has imported, such as torch's compiler, too."""
+    yield
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for part, reason in _absent(item):

@@ -84,6 +84,7 @@ def test_collectives_give_the_numbers_of_all_processes(tmp_path):
     in_processes(3, COLLECTIVES, tmp_path)
 
 
+@pytest.mark.slow
 @needs_gloo
 @pytest.mark.skipif(sys.platform == "win32", reason="torchrun needs libuv on Windows")
 def test_processes_hold_equal_networks_and_draw_other_rays(tmp_path):

@@ -101,6 +101,7 @@ def test_regions_fill_the_box(source):
     torch.testing.assert_close(sides.prod(1).sum(), (scene.box[1] - scene.box[0]).prod())
 
 
+@pytest.mark.slow
 def test_regions_are_trained_and_joined(tmp_path, capsys):
     assert main(words("regions builtin-city:2x1 --count 2 --out", tmp_path)) == 0
     *jobs, join = (line.split()[1:] for line in capsys.readouterr().out.splitlines())
