@@ -4,9 +4,9 @@
     python benchmarks/distributed.py --data LEGO --kills 20 --json benchmarks/results/distributed_kills.json
     python benchmarks/distributed.py --data builtin-city:8x8 --regions 16 --json benchmarks/results/regions.json
 
-The first command compares two processes with one process of two threads, at equal steps and rays of a step. Each way
-runs in processes of its own, in turns over the seeds. ``average_us`` is the time of the average in a step, with the
-wait for the other process; ``alone_us`` is the time of the average alone, after a barrier; ``equal`` says whether both
+The first command compares two processes with one process of two threads, at equal steps and rays of a step. Each side
+runs in processes of its own, in turns over the seeds. ``average_us`` is the time in which a step averages gradients and
+waits for the other process; ``alone_us`` is the time without the wait, after a barrier; ``equal`` says whether both
 processes end with the same bits. The second command kills one of the processes of ``torchrun --max-restarts`` again and
 again, at random moments. The third trains regions one after another and joins them, then trains the whole scene in 1.2
 times the processor time: with as many parameters, and with the default tables.
@@ -59,7 +59,7 @@ class Options:
     seeds: tuple[int, ...] = (0, 1)
     """The seeds of the trainings."""
     kills: int = 0
-    """The number of times that a process is killed; 0 compares the ways instead."""
+    """The number of times that a process is killed; 0 compares two processes with one instead."""
     regions: int = 0
     """The number of regions; 0 compares processes instead."""
     seconds: float = 60
@@ -146,7 +146,7 @@ def in_turns(options: Options) -> list[dict[str, Any]]:
 
 
 def killed(options: Options) -> dict[str, Any]:
-    """Kills a process of a training again and again; returns what the run has at the end."""
+    """Kills a process of a training again and again; returns the finished run's steps and the longest wait."""
     choose = random.Random(options.seeds[0])
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"

@@ -2,7 +2,7 @@
 
 One thread walks along one ray, twice: first to count its samples and then, with the offsets, to write them. So no mask
 of strata needs to be stored. Operations and their order equal the reference's, each rounded separately (``fuse_fp``
-off), so that a sample falls in the same cell.
+off), so that a sample falls in the same voxel.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ def _march_kernel(inputs: Inputs, counting: wp.bool, offsets: wp.array(dtype=wp.
 
 @_OP.custom_op("march_rays_warp", fake=fake)
 def march_rays(arguments: Any) -> March:
-    """Returns samples in occupied cells; see ``voronerf.ops.march_rays``."""
+    """Returns samples in occupied voxels; see ``voronerf.ops.march_rays``."""
     near, r, capacity, inputs = arguments.near, arguments.r, arguments.capacity, _inputs(arguments)
     counts = near.new_zeros(r + 1, dtype=torch.int32)
     out = filled(Samples(), counts=counts[1:], positions=arguments.origins[:0])

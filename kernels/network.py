@@ -303,7 +303,7 @@ Terms = tuple[Product | Columns, ...]
 
 
 class Layer(NamedTuple):
-    """A layer of some width."""
+    """A layer: the sum of products and biases, [n, width]."""
 
     width: int
     products: tuple[Product, ...]
@@ -328,7 +328,7 @@ class Lowered(NamedTuple):
     after: Program
 
 
-@constant_result  # around the cached function, which torch.compile would trace
+@constant_result  # not on the cached function, which torch.compile would trace
 def lower(text: str) -> Lowered | None:
     """Returns the parts of a program; None if it has no layer that the kernels can run, or sums over rows."""
     return _lower(text)
@@ -418,7 +418,7 @@ def _span(columns: Columns, first: int = 0) -> range:
 
 
 class _Before(Run):
-    """A run of the steps before the layers, with Warp kernels for encodings."""
+    """A :class:`Run` of the steps before the layers, with Warp kernels for encodings."""
 
     def encoded(self, step: Step, operands: Sequence[Tensor]) -> Tensor:
         """Returns an encoding or one of its derivatives, [n, w]."""

@@ -1,4 +1,4 @@
-"""``observe_occupancy`` as Warp kernels, in place. x, y, z cells along each axis, m samples."""
+"""``observe_occupancy`` as Warp kernels, in place. x, y, z voxels along each axis, m samples."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _fade_kernel(
     i = wp.tid()
     if cells[i] < 0:
         return
-    # `before` is the old density, so all samples of a cell write the same value.
+    # `before` is the old density, so all samples of a voxel write the same value.
     density[cells[i]] = before[i] * decay
 
 
@@ -127,7 +127,7 @@ def _compare_kernel(
 
 @declared("observe_occupancy").custom_op("observe_occupancy_warp")
 def observe_occupancy(arguments: Any, _: None) -> None:
-    """Updates the cells of the samples: decays and raises densities; see ``voronerf.ops.observe_occupancy``."""
+    """Updates the voxels of the samples: decays and raises densities; see ``voronerf.ops.observe_occupancy``."""
     density, m = arguments.density, arguments.positions.shape[0]
     cells, before = density.new_empty(m, dtype=torch.int32), density.new_empty(m)
     flat, rows, faded = (array(tensor, density) for tensor in (density.view(-1), cells, before))

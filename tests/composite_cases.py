@@ -35,7 +35,7 @@ def dense(r: int, s: int, c: int = 3, background: str = "ray") -> dict:
 
 
 def leaves_of(arguments: dict, dtype: torch.dtype) -> tuple[dict, list[Tensor]]:
-    """Returns (arguments, list of the floating-point tensors); these get the dtype and require gradients."""
+    """Returns (arguments, list of the floating-point tensors); the tensors get the dtype and require gradients."""
     cast = {
         name: tensor.to(dtype).requires_grad_() if tensor is not None and tensor.is_floating_point() else tensor
         for name, tensor in arguments.items()

@@ -99,7 +99,7 @@ def test_limits_of_malloc_are_the_programs() -> None:
 
 
 def test_classes_and_hooks_are_the_same_during_a_trace(monkeypatch: pytest.MonkeyPatch) -> None:
-    for kind in (torch.optim.Adam, torch.optim.SGD):  # the first step of each changes its class
+    for kind in (torch.optim.Adam, torch.optim.SGD):  # the first step of an optimiser changes its class
         kind(nn.Linear(1, 1).parameters()).step()
     before, during, profiles = host(), list[list[Any]](), list[Any]()
     entered, go_on, other = threading.Event(), threading.Event(), dict[str, Any]()

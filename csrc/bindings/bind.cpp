@@ -57,7 +57,7 @@ void call(const Loaded& loaded, Result& result) {
 // Row counts are read again from memory at each replay, so tensors must be large enough for the largest row counts.
 class Recording {
  public:
-  // Calls of this thread between `begin` and `end` are added to the recording, which owns itself in between.
+  // Calls of this thread between `begin` and `end` are added to the recording, which keeps itself alive.
   static void begin(const py::object& self) {
     if (recording() != nullptr) throw std::logic_error("another recording is active");
     recording() = py::cast<Recording*>(self);

@@ -20,7 +20,7 @@
 #include "common/isa.h"
 
 // VN_CUDA and VN_CPU give a pointer to a function. In a build without CUDA, VN_CUDA gives a null pointer of the
-// function's type instead; in the emulated build, VN_CPU does.
+// function's type instead; in the emulated build, VN_CPU gives such a null pointer.
 #ifdef VN_WITH_CUDA
 #define VN_CUDA(...) &__VA_ARGS__
 #else

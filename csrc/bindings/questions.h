@@ -64,7 +64,7 @@ struct Questions {
     if (tensor == nullptr) throw py::error_already_set();
     return py::reinterpret_steal<py::object>(tensor);
   }
-  // Returns the same as native.cpu() in Python.
+  // Returns the instruction set and the number of threads, like native.cpu() in Python.
   Cpu cpu() const {
     static PyObject *const isa_word = PyUnicode_InternFromString("_isa"), *const threads_word =
                                                                               PyUnicode_InternFromString("threads");

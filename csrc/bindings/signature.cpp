@@ -102,7 +102,7 @@ class Plan {
     fault_ = parts[4];
   }
 
-  // Runs the function and returns its results; null if no overload takes these arguments.
+  // Runs the function and returns its results; null if no overload takes the arguments or a result has no view.
   py::object run(CheckedCall& call, const py::object& inputs, size_t count) const {
     std::vector<py::object> results;
     results.reserve(results_.size());
@@ -475,7 +475,7 @@ class Signature {
     call.values[i] = call.own.back().ptr();
     return false;
   }
-  // Returns whether the arguments that are compared have one dtype, so that nothing is to prepare.
+  // Returns whether both arguments in Declaration.compared are float32 or both are float64: `prepare` is then left out.
   bool are_alike(const CheckedCall& call) const {
     if (compared_.empty()) return false;
     const unsigned one = call.views[compared_[0]].dtype(), two = call.views[compared_[1]].dtype();

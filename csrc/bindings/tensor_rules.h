@@ -28,7 +28,7 @@ inline unsigned mask_of(const std::string& name) {
   }
   return kOther;
 }
-// Returns "float32, float64 or int32".
+// Returns the names of dtypes as in "float32, float64 or int32".
 inline std::string names_of(unsigned dtypes) {
   std::string text;
   for (const auto& [name, mask] : masks()) {
@@ -145,7 +145,7 @@ struct TensorRule {
   unsigned dtypes = 0;  // 0: the dtype of the first floating-point tensor
   bool wide = false, either = false, small = false, written = false;
   std::vector<Letters::Size> shape, otherwise;
-  Letters::Size fallback;  // of a row that is no rule of a tensor: the value of a letter that is still unbound
+  Letters::Size fallback;  // in a row of class checks.Default, no rule of a tensor: a letter and its default value
 
   static TensorRule of(const py::handle& row, Letters& letters) {
     TensorRule rule;
@@ -168,7 +168,7 @@ struct TensorRule {
     rule.otherwise = letters.sizes(row.attr("otherwise"));
     return rule;
   }
-  // Checks a tensor, fills its view, and raises the error. `second`: it has the second shape.
+  // Checks a tensor, raises the error if it breaks the rule, and fills its view. `second`: it has the second shape.
   void check(PyObject* tensor, TensorView& view, bool second, Common& common) const {
     common.look(name, tensor, view);
     const auto& sizes = (second && !otherwise.empty()) || (either && view.dimensions != static_cast<int>(shape.size()))

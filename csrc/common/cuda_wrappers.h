@@ -204,7 +204,7 @@ __device__ __forceinline__ void load_matrices(uint32_t (&words)[4], const uint32
   }
 }
 
-// Stores what load_matrices loads.
+// Stores fragments to the places from which load_matrices loads them.
 template <bool kShared>
 __device__ __forceinline__ void store_matrices(uint32_t* to, const uint32_t (&words)[4], int stride, int lane) {
 #if !defined(VN_EMULATE) && __CUDA_ARCH__ >= 900

@@ -48,9 +48,9 @@ void with_team(int threads, const Body& body) {
   parallel(threads, [&](int thread) { thread == 0 ? team.lead(body) : team.follow(); });
 }
 
-// Distributes items 0 to count - 1 among the threads of a team, in runs of `run`. Every thread has a contiguous part of
-// the items and takes its runs in order; then it steals runs from the other parts. So a thread takes mostly the same
-// items in every call, and its cache still holds the results of the previous call.
+// Distributes items 0 to count - 1 among the threads of a team, in runs of `run` neighbouring items. Every thread has a
+// contiguous part of the items and takes its runs in order; then it steals runs from the other parts. So a thread takes
+// mostly the same items in every call, and its cache still holds the results of the previous call.
 class Items {
  public:
   Items(int64_t count, int64_t run, int threads) : run_(run) {
@@ -85,7 +85,7 @@ class Items {
   const int64_t run_;
 };
 
-// Calls body(item) for the items of a run. A function of its own: inlined into parallel_for, the body's loops would
+// Calls body(item) for the items of a run. This is not inlined: inside parallel_for, the body's loops would
 // share registers with the distribution of the items, and cell_sort would take 1.5 times as long.
 template <typename Body>
 __attribute__((noinline)) void run_items(const Body& body, int64_t begin, int64_t end) {

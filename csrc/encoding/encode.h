@@ -33,7 +33,7 @@ void encode_backward_cuda(const Encoding& in, const float* gradient, float* grad
 constexpr int64_t kEncodeRows = 32;   // rows of a tile, which stays in cache
 constexpr int64_t kEncodeLanes = 16;  // lanes of the widest vector
 
-// Encode rows `begin` to `end` on the calling thread. stride: floats between encoded rows in the workspace.
+// Encodes rows `begin` to `end` on the calling thread. stride: floats between encoded rows in the workspace.
 VN_DECLARE_FOR_ISA(void encode_rows(const Encoding& in, float* out, float* workspace, int64_t stride, int64_t begin,
                                     int64_t end))
 VN_DECLARE_FOR_ISA(void encode_rows_backward(const Encoding& in, const float* gradient, float* grad_x,

@@ -3,8 +3,8 @@
 //
 // Each point and level needs eight loads at random addresses. The other work must not cost more than these loads.
 // Indices and weights, some 60 operations for a whole vector, pass through the L1 cache, and an entry of two features
-// takes one load, one broadcast of its weight and one multiply-add. Gathers are 50 % slower on Zen 5, where they are
-// microcoded. The arithmetic of one point is in hash_encode_math.h.
+// takes one load, one broadcast of its weight and one multiply-add. On Zen 5, gathers in place of these loads
+// are 50 % slower, because they are microcoded. The arithmetic of one point is in hash_encode_math.h.
 #pragma once
 
 #include "common/memory_tile.h"

@@ -129,7 +129,7 @@ VN_INLINE F32 box_distance(const float* low, const F32* point) {
 
 // The nearest centre of one point: its cell, and its address in the index.
 struct Found {
-  const float* at;  // first coordinate of the centre; null if float32 does not decide
+  const float* at;  // first coordinate of the centre; null if float32 is too coarse
   int32_t cell;
 };
 

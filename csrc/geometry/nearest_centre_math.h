@@ -28,7 +28,8 @@ constexpr double kLargest = 1.7976931348623157e308;
 // Returns the margin for values whose lowest bits are an index.
 VN_HD float nearest_margin(int index_bits) { return kMargin + 2.5f * static_cast<float>(1 << index_bits) / 8388608.0f; }
 
-// Returns whether float32 decides. `second` is the smallest computed value of all centres but the best one.
+// Returns whether float32 has certainly found the nearest centre. `second` is the smallest computed value of all
+// centres but the best one.
 VN_HD bool nearest_is_certain(float best, float second) { return best + (kMargin * best + kFloor) < second; }
 
 // Returns sum + d * d with both operations rounded. On the host -ffp-contract=off ensures this.

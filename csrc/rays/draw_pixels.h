@@ -11,12 +11,12 @@ namespace voronerf {
 
 struct DrawPixelsInputs {
   const int32_t* seed;   // [1]
-  const int64_t* ends;   // [n], running sums of the runs' lengths; or null for all pixels 0 to below - 1
+  const int64_t* ends;   // [n], running sums of the runs' lengths; or null: every pixel < `below`
   const int64_t* shift;  // [n], pixel minus place, for the places in each run
   const int32_t* first;  // the first runs that end behind places 0, 2^bits, 2 * 2^bits, ...; they speed up the search
   int64_t n, places;     // n: entries of ends and shift; places: entries of first
   int64_t bits;
-  int64_t below;  // the total number of places in all runs
+  int64_t below;  // the number of places in all runs; without runs, of pixels
   RowCount b;
   const int64_t* known_pixels;  // [p], the known pixels, from which the first pixels are drawn; or null
   const float* distances;       // [p], the distances of the known pixels

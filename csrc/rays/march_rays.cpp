@@ -16,13 +16,13 @@ namespace {
 
 constexpr int64_t kRays = 32;  // rays of a task
 
-// Lowers the distances to the nearest occupied cell in a row of cells, `to` [cells], by the distances `from` [cells] in
-// a parallel row that is `away` cells away: the Chebyshev distance by way of cell j of `from` is max(from[j], away).
+// Lowers the distances to the nearest occupied voxel in a row of voxels, `to` [cells], by the distances `from` [cells]
+// in a parallel row, `away` voxels away: the Chebyshev distance by way of voxel j of `from` is max(from[j], away).
 void spread(const uint8_t* from, uint8_t* to, int64_t cells, uint8_t away) {
   for (int64_t j = 0; j < cells; ++j) to[j] = std::min(to[j], std::max(from[j], away));
 }
 
-// Computes the distances in slice i of `size` slices, of `step` cells each, from the distances in the slices around it.
+// Computes the distances in slice i of `size` slices, of `step` voxels each, from the distances in nearby slices.
 void spread_around(const uint8_t* from, uint8_t* to, int64_t i, int64_t size, int64_t step) {
   uint8_t* target = to + i * step;
   std::copy_n(from + i * step, step, target);

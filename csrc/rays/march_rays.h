@@ -1,4 +1,4 @@
-// Samples rays in the occupied cells of a grid: r rays, s strata each, m kept samples. The formulas are in
+// Samples rays in the occupied voxels of a grid: r rays, s strata each, m kept samples. The formulas are in
 // voronerf/ops/march_rays, and every rounded operation is in voronerf/ops/march_rays/reference.py.
 //
 // There are two calls, since the number of samples is known only after the first call. The first call sets a bit for

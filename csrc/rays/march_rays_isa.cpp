@@ -1,7 +1,7 @@
 // The CPU kernels of march_rays, compiled once per instruction set.
 //
 // Strata are processed in words of 32. Their positions are computed without branches, which the compiler vectorises;
-// each cell is looked up by a byte load. A ray that has its maximum of samples stops after the current word.
+// each voxel is looked up by a byte load. A ray that has its maximum of samples stops after the current word.
 //
 // Whole images have many strata, most of them empty, and their samples are middles. For them, a vector holds rays
 // instead of strata, and each ray leaps to the next stratum that may be occupied (`leap`). `leap` tests the same
@@ -27,7 +27,7 @@ struct Space {
   static constexpr MarchWhere kWhere = W;
 };
 
-// Computes the cells of 32 strata from `first` on, -1 outside the box.
+// Computes the voxels of 32 strata from `first` on, -1 outside the box.
 template <MarchWhere W, typename Spacing>
 VN_INLINE void cells_of(const MarchInputs& in, const MarchRay& ray, const float* origin, const float* direction,
                         const float* scale, const float* uniforms, int64_t first, int32_t* cells) {
@@ -84,16 +84,16 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
   }
 }
 
-// Returns whether strata are wide compared with the rounding of their depths. Then middles lie between their edges, and
-// a depth determines its stratum.
+// Returns whether strata are wide compared with the rounding of their depths. Then a stratum's middle lies between its
+// edges, and a depth determines its stratum.
 template <typename Spacing>
 VN_INLINE bool wide(const MarchRay& ray) {
   const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
   return Spacing::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
 }
 
-// Returns an upper bound on the cells that a ray crosses per unit of distance, valid for the next kMarchRoom cells.
-// `width` is the size of a cell in the grid's space.
+// Returns an upper bound on the voxels that a ray crosses per unit of distance, valid for the next kMarchRoom voxels.
+// `width` is the size of a voxel in the grid's space.
 template <MarchWhere W>
 VN_INLINE float pace_of(const MarchInputs& in, float width, const float* origin, const float* direction, float length,
                         float at, const float* point) {
@@ -161,14 +161,14 @@ VN_INLINE void enter(const MarchInputs& in, float width, int64_t i, int64_t j, W
   walk.ray[j] = static_cast<int32_t>(i), walk.samples[j] = 0;
   walk.stratum[j] = in.start == nullptr || in.start[i] < 0 ? 0 : in.start[i];
   walk.near[j] = ray.near, walk.far[j] = ray.far, walk.length[j] = __builtin_sqrtf(square);
-  // slack: the rounding error of a position, in cells. share: the number of strata per unit of `progress`
+  // slack: the rounding error of a position, in voxels. share: the number of strata per unit of `progress`
   // (march_rays_math.h).
   walk.slack[j] = 1e-3f + 1e-6f * (away + __builtin_fabsf(ray.far) * walk.length[j]) / width;
   walk.share[j] = Spacing::rate(ray) * ray.count;
 }
 
-// Marches the rays of [begin, end) whose count is kToWalk, through the middles of strata. From an empty cell a ray
-// leaps the distance within which no cell can be occupied. A lane whose ray has ended takes the next ray.
+// Marches the rays of [begin, end) whose count is kToWalk, through the middles of strata. From an empty voxel a ray
+// leaps the distance within which no voxel can be occupied. A lane whose ray has ended takes the next ray.
 template <MarchWhere W, typename Spacing>
 VN_INLINE void leap(const MarchInputs& in, const uint8_t* room, const float* scale, uint32_t* mask, int32_t* counts,
                     int64_t begin, int64_t end) {

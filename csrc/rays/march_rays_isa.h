@@ -8,9 +8,9 @@ namespace voronerf {
 // The largest value in `room`.
 constexpr int kMarchRoom = 4;
 
-// Writes the number of samples of ray i to counts[i]. room: for each cell of the grid, the Chebyshev distance in cells
-// to the nearest occupied cell, at most kMarchRoom (0 if the cell itself is occupied); or null. `room` must be null
-// unless samples are the middles of strata.
+// Writes the number of samples of ray i to counts[i]. room: for each voxel of the grid, the Chebyshev distance in
+// voxels to the nearest occupied voxel, at most kMarchRoom (0 if the voxel itself is occupied); or null. `room` must be
+// null unless samples are the middles of strata.
 VN_DECLARE_FOR_ISA(void march_count(const MarchInputs& in, const uint8_t* room, uint32_t* mask, int32_t* counts,
                                     int64_t begin, int64_t end))
 VN_DECLARE_FOR_ISA(void march_fill(const MarchInputs& in, const uint32_t* mask, const int32_t* offsets,

@@ -1,5 +1,5 @@
 // Arithmetic of march_rays for one stratum, on the CPU and on CUDA. Each operation is rounded separately, as in the
-// reference, so that a sample lies in the same cell on every device. The build turns contraction off for C++; nvcc
+// reference, so that a sample lies in the same voxel on every device. The build turns contraction off for C++; nvcc
 // contracts, but not products written as march_product.
 #pragma once
 
@@ -123,7 +123,7 @@ VN_HD void march_point(const MarchInputs& in, MarchWhere where, const float* ori
   }
 }
 
-// Returns the grid cell at a point, -1 outside the box. scale: cells per unit of length along each axis.
+// Returns the voxel at a point, -1 outside the box. scale: voxels per unit of length along each axis.
 VN_HD int32_t march_cell(const MarchInputs& in, const float* scale, const float* point) {
   const int64_t size[3] = {in.x, in.y, in.z};
   int32_t cell = 0;

@@ -1,4 +1,4 @@
-// Distances to occupied cells, which let rays leap over empty cells; for march_rays and render_opaque on the CPU.
+// Distances to occupied voxels, which let rays leap over empty voxels; for march_rays and render_opaque on the CPU.
 #pragma once
 
 #include <memory>
@@ -7,8 +7,8 @@
 
 namespace voronerf {
 
-// Returns the `room` of march_count (march_rays_isa.h), or null if rays should not leap over empty cells. The
-// computation visits all cells. It pays if there are many more strata than cells, as in a whole image, but not in a
+// Returns the `room` of march_count (march_rays_isa.h), or null if rays should not leap over empty voxels. The
+// computation visits all voxels. It pays if there are many more strata than voxels, as in a whole image, but not in a
 // training step.
 std::unique_ptr<uint8_t[]> march_rooms(const MarchInputs& in, int threads);
 

@@ -1,7 +1,7 @@
-// observe_occupancy on the CPU. Only cells with samples are touched: a step has some thousands of samples, the grid a
-// quarter of a million cells. First the threads compute each sample's cell and its new density. Several samples may
-// share a cell, so each thread then updates its own part of the grid; the samples of a run are sorted by part in the
-// first phase.
+// observe_occupancy on the CPU. Only voxels with samples are touched: a step has some thousands of samples, the grid a
+// quarter of a million voxels. First the threads compute each sample's voxel and the voxel's new density. Several
+// samples may share a voxel, so each thread then updates its own part of the grid; the samples of a run (kRun) are
+// sorted by part in the first phase.
 #include "rays/observe_occupancy.h"
 
 #include <algorithm>
@@ -51,7 +51,7 @@ void observe_occupancy_cpu(const ObservedSamples& in, float* density, uint8_t* o
         for (int64_t i = part == 0 ? run * kRun : ends[index - 1]; i < ends[index]; ++i) body(cells[i], values[i]);
       }
     };
-    // First set each cell to the value of any of its samples, then raise it to their maximum.
+    // First set each voxel to the value of any of its samples, then raise it to their maximum.
     for_each_sample([&](int32_t cell, float value) { density[cell] = value; });
     for_each_sample([&](int32_t cell, float value) {
       density[cell] = std::max(density[cell], value);

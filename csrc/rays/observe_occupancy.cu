@@ -1,7 +1,7 @@
 // Updates an occupancy grid from samples on CUDA, one thread per sample, in three launches: one sample claims each
-// cell, the cell's density decays, and all of its samples raise it. Densities are not negative, so their bits sort like
-// integers and their sign bits are free: the first sample to set a cell's sign bit claims the cell. No two threads
-// store to the same place.
+// voxel, the voxel's density decays, and all of its samples raise it. Densities are not negative, so their bits sort
+// like integers and their sign bits are free: the first sample to set a voxel's sign bit claims the voxel. No two
+// threads store to the same place.
 #include "common/cuda_wrappers.h"
 #include "rays/observe_occupancy_math.h"
 
@@ -14,7 +14,7 @@ constexpr unsigned kSign = 0x80000000u;
 
 __device__ __forceinline__ int64_t this_sample() { return static_cast<int64_t>(blockIdx.x) * kThreads + threadIdx.x; }
 
-// cells: -1 for samples that update no cell. before: the old density of a claimed cell, -1 for samples that claim none.
+// cells: the samples' voxels, -1 for no update. before: the old density of a claimed voxel; -1 if none is claimed.
 __global__ void __launch_bounds__(kThreads)
     claim_kernel(ObservedSamples in, unsigned* density, int32_t* __restrict__ cells, float* __restrict__ before) {
   const int64_t i = this_sample();
@@ -48,7 +48,7 @@ __global__ void __launch_bounds__(kThreads)
   const int old = atomicMax(density + cells[i], bits);
   float previous;
   memcpy(&previous, &old, sizeof previous);
-  // At most one sample of a cell writes here.
+  // At most one sample of a voxel writes here.
   if (seen >= in.threshold && !(previous >= in.threshold)) occupied[cells[i]] = 1;
 }
 

@@ -9,7 +9,7 @@
 
 namespace voronerf {
 
-// Returns the cell of a sample. A NaN coordinate is in the first cell of its axis.
+// Returns the voxel of a sample. A NaN coordinate is in the first voxel of its axis.
 VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   const int64_t size[3] = {in.x, in.y, in.z};
   int64_t cell = 0;
@@ -22,7 +22,7 @@ VN_HD int64_t observed_cell(const ObservedSamples& in, int64_t i) {
   return cell;
 }
 
-// Returns whether a sample updates its cell. It does not if its delta is 0 or the cell is fixed.
+// Returns whether a sample updates its voxel. It does not if its delta is 0 or the voxel is fixed.
 VN_HD bool observes(const ObservedSamples& in, int64_t i, int64_t cell) {
   return (in.deltas == nullptr || in.deltas[i] != 0.0f) && (in.fixed == nullptr || in.fixed[cell] == 0);
 }
@@ -44,8 +44,8 @@ VN_HD float observed_stretch(const ObservedSamples& in, int64_t i) {
   return 1.0f;
 }
 
-// Returns the density that a sample observes in its cell: its own density, or 0 if at most the fraction `hidden`
-// of the light reaches it.
+// Returns the density that a sample observes in its voxel: its own density per length in the grid's space, or 0 if
+// at most the fraction `hidden` of the light reaches it.
 VN_HD float observed_density(const ObservedSamples& in, int64_t i) {
   const float density = in.sigma[i] == in.sigma[i] ? in.sigma[i] : INFINITY;
   if (in.weights == nullptr) return density * observed_stretch(in, i);

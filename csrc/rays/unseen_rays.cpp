@@ -10,7 +10,7 @@
 namespace voronerf {
 
 constexpr uint32_t kBefore = 5;   // hashes of a ray that draw_pixels takes from the same seed
-constexpr float kOctaves = 4.0f;  // range of the distances between neighbours
+constexpr float kOctaves = 4.0f;  // octaves of the angles between neighbours
 
 void unseen_rays_cpu(const UnseenRays& in, float* origins, float* directions, int threads) {
   constexpr int64_t kTriples = 128;  // triples of a task

@@ -560,5 +560,5 @@ CHANGES = (
     *(mode, freeze, unfreeze, subdivide, save, load, data, written, inplace, attribute, attribute, copied, stored),
     *(dtype, halves, requires, learn, cell, ask, options),
 )
-#: Changes that may happen in inference mode; others make tensors by torch alone, which are then of inference mode.
+#: Changes that may happen in inference mode; others make tensors by torch alone, which would be inference tensors.
 INSIDE = {mode, freeze, unfreeze, subdivide, save, load, written, inplace, copied, cell, ask, options}

@@ -33,7 +33,7 @@ def stranger_scene(rng: random.Random, folder: Path, inputs: Path) -> str:
         raise Failed("an image outside of the scene was read")
     if sorted(file.name for file in outside.iterdir()) != ["secret.png"]:
         raise Failed("something was written outside")
-    # Pictures whose file of cameras is gone are a capture, of which COLMAP's results stay.
+    # For pictures without a file of cameras, COLMAP runs, and its results stay in `capture`.
     if verdict == "refused" and out.exists() and [path.name for path in out.iterdir()] != ["capture"]:
         raise Failed(f"{sorted(out.rglob('*'))} were written for a scene that was refused")
     return verdict

@@ -69,8 +69,8 @@ def test_turns():
     assert all(fake.seconds >= 3.0 for fake in fakes)
     refuses("--turn must be positive, got 0", turns.take_turns, fakes, budget=1, turn=0, error=ConfigError)
 
-    # A run that resumes within a turn repeats the whole turn: `on_stop` is also called for the turn's stop at 4.5 s,
-    # which the run has already passed.
+    # A training that resumes within a turn repeats the whole turn: `on_stop` is also called for the turn's stop at
+    # 4.5 s, which the training has already passed.
     looks = []
     stops, on_stop = lambda fake: (3.0, 4.5, 5.0), lambda fake, second: looks.append(second)
     turns.take_turns([Fake("a", 4.7, 0.5)], budget=6.0, turn=2.0, stops=stops, on_stop=on_stop)

@@ -189,8 +189,8 @@ void prepare(Fiber& fiber) {
 }
 
 // Runs a block in rounds. In a round, every fiber that can go on runs to its next operation of the warp or the block,
-// in shuffled order. `ahead`: a warp runs to its next barrier of the block before the other warps. A lost __syncthreads
-// shows only then, if the code before it ends in an operation of the warp, after which the warps are in step.
+// in shuffled order. `ahead`: a warp runs to its next barrier of the block before the other warps. Otherwise a missing
+// __syncthreads does not show if the code before it ends in a warp operation, after which all warps are in step.
 void run_block(Launch& it, Block& block, std::mt19937_64& random, bool ahead) {
   const auto threads = static_cast<unsigned>(block.fibers.size());
   std::vector<unsigned> order(threads), warps(threads / 32);

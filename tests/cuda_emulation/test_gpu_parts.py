@@ -84,7 +84,7 @@ def test_cases_by_name(parts, tmp_path):
 
 @pytest.mark.native
 def test_a_row_of_a_network_is_captured(parts, monkeypatch, tmp_path):
-    """Captures the benchmark of a network with gradients as a CUDA graph; the test of the first call lacks the time.
+    """Captures a network's benchmark with gradients as a CUDA graph, which the test of the first call has no time for.
 
     A benchmark in which the host waits for the device is not captured.
     """

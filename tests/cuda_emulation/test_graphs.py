@@ -180,7 +180,7 @@ def test_precision_of_a_traced_field():
 
 
 def test_a_router_does_not_check_its_parameters_in_a_capture(monkeypatch):
-    """After some calls in Python a router reads its parameters; with each number of rays a step is captured anew."""
+    """Reading parameters, as a router does after `PATIENCE` calls in Python, would end a capture."""
     monkeypatch.setattr(optimizers, "PATIENCE", 3)
     with emulated(), graphs() as seen:
         state = built()

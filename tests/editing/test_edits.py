@@ -162,7 +162,7 @@ def test_a_region_is_cut_exactly(opened, tmp_path) -> None:
         assert occupied.any() and torch.equal(density[occupied], wanted)
     assert (kept.scene.box[1] - kept.scene.box[0]).max() <= 0.8 + 2 * 2.36 / 16
     size = {path: sum(map(len, contents(tmp_path / path).values())) for path in ("kept", "rest")}
-    voxels = run.renderer.occupancy.occupied.numel()  # bytes of the training's voxels, which the networks keep
+    voxels = run.renderer.occupancy.occupied.numel()  # bytes of the training's voxels, which a cut run keeps, too
     assert size["kept"] <= size["rest"] < sum(map(len, contents(run.path).values())) + voxels
 
 
@@ -362,7 +362,7 @@ def test_an_unbounded_run_is_cut_and_gets_an_object(tmp_path, scene) -> None:
     thing = cut_run(run, Solid(ball=(0, 0, 0, 0.6)), tmp_path / "thing")
     assert thing.scene.box is not None and thing.renderer.occupancy is not None
     assert thing.router[0].contraction is None
-    assert thing.scene.box[0, 0] > -0.3 and thing.scene.box[1, 0] > 0.4  # a half of the ball was empty in the training
+    assert thing.scene.box[0, 0] > -0.3 and thing.scene.box[1, 0] > 0.4  # half of the ball was empty in the run's grid
     both = placed_run(run, thing, (0, 0, 0.5), tmp_path / "both", scale=0.4)
     assert both.scene.box is None and both.router[0].contraction is not None and both.renderer.occupancy is None
     points = torch.randn(300, 3)

@@ -51,7 +51,7 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
     refuses("unexpected keyword argument 'y'", compiled.Encoding, y=points, variances=None, **sizes, error=TypeError)
     whole = compiled.Encoding(x=points, variances=None, **sizes)
     compiled.encode(whole, torch.empty(4, 9), cpu)
-    for count in range(len(whole)):  # the class is known from the call above
+    for count in range(len(whole)):  # the compiled module knows the class from the call above
         with pytest.raises(TypeError, match="incompatible function arguments"):
             compiled.encode(tuple.__new__(compiled.Encoding, whole[:count]), torch.empty(4, 9), cpu)
 

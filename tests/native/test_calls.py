@@ -187,7 +187,7 @@ def test_an_interrupted_recording_ends(monkeypatch):
         return recording
 
     assert record().obstacle is None and vars(_python_dispatch) == flags
-    gc.collect()  # a collection while places are counted would add its callbacks
+    gc.collect()  # a garbage collection during the count would add the places of its callbacks
     with Interrupt() as counting:
         record()
     for place in range(1, counting.places):

@@ -157,14 +157,14 @@ NOTED = {
 @pytest.mark.parametrize("way", ["exchange", "methods", "no module"])
 @pytest.mark.parametrize("name", NOTED)
 def test_values_are_compared(name, way, monkeypatch):
-    """Writes that no version counter counts are found; values that come back are the same."""
+    """Writes that no version counter counts are found; a value that comes back counts as unchanged."""
     tensor = NOTED[name]()
     if way == "no module":
         monkeypatch.setattr(backends, "compiled", lambda: None)
     with exchange(way != "methods"):
         values, guard = Values(tensor), unchanged()
         values.note(guard)
-        exact = way == "exchange" or (way == "methods" and name != "NaN")  # a guard may ask more often than needed
+        exact = way == "exchange" or (way == "methods" and name != "NaN")  # else it may report a change that was none
         assert not values.changed() and guard.holds() == exact
         last = (-1,) * tensor.dim()
         was = tensor.data[last].clone() if tensor.numel() else None

@@ -321,7 +321,7 @@ def test_specks_are_dropped_and_thin_things_stay():
 
 
 def test_a_grid_that_is_mostly_full_at_the_end_is_emptied_by_its_field():
-    """A full grid makes pictures slow. A field that cannot tell empty space, and a box of dense things, stay as is."""
+    """A field empties a grid that is more than half full, unless the field cannot tell empty space."""
 
     def fog(positions, directions, ray_index):
         return torch.ones_like(positions), torch.full_like(positions[:, 0], 0.5)

@@ -59,7 +59,7 @@ def test_tables_move_where_they_have_a_gradient_and_keep_it():
 
 
 def test_cells_without_samples_keep_their_bits():
-    """Cells of the batch take the first step of ``torch.optim.Adam``; other cells keep parameters and moments."""
+    """Cells with samples take the first step of ``torch.optim.Adam``; other cells keep parameters and moments."""
     generator, options = torch.Generator().manual_seed(0), {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-8}
     routers = [VoronoiRouter(torch.nn.Linear(8, 3), 50, fuse=True) for _ in range(2)]
     routers[1].load_state_dict(routers[0].state_dict())

@@ -284,7 +284,7 @@ def test_what_moves_is_followed():
             recorded = training.recorded
             move(training)
             steps[name] = [*training.train(1, as_it_is=as_it_is), training.step(64, 2, at=1023).loss.clone()]
-            still = name in ("averages", "nothing")  # the segment after a step uses the averages
+            still = name in ("averages", "nothing")  # only the segment after a step uses averages
             assert as_it_is or (training.recorded > recorded) != still, name
             steps[name] += [tensor.detach().clone() for tensor in training.everything() if tensor is not None]
         results.append(steps)
@@ -404,11 +404,11 @@ def test_a_second_optimizer_learns(field):
 @pytest.mark.parametrize("settled", [0, 64])
 @pytest.mark.parametrize("steps", [6, 7, 10, 32])
 def test_any_number_of_steps_of_a_call_keeps_averages_and_decay(steps, settled):
-    """The grid also starts to learn at the right step, even in the middle of a call or after its field has learnt."""
+    """The grid is also first updated at the right step, in the middle of a call or once its field has learnt."""
     results = []
     for calls in (96 // steps * [steps] + [96 % steps], 96 * [1]):
         training, done = Training(cells=2), 0
-        training.optimizer.average, answers = 0.9, iter([False, False, True])  # asked at the steps 40, 48 and 64
+        training.optimizer.average, answers = 0.9, iter([False, False, True])  # at the steps 40, 48 and 64
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("voronerf.nerf.samplers.WARMUP_STEPS", 40)
             if settled:

@@ -362,7 +362,7 @@ def in_python(name):
 @pytest.mark.native
 @pytest.mark.parametrize("op", [op for op in CASES if op not in NETWORKS])
 def test_the_compiler_sees_the_checks_of_the_compiled_module(op):
-    """Each argument in turn has another floating-point dtype than the others; all arguments fit if it is the same."""
+    """Checks in Python and in C++ refuse the same calls: each argument has each floating-point dtype in turn."""
     case, name = CASES[op], CASES[op].call or op
     call = getattr(ops, name)
 

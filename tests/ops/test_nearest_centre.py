@@ -100,7 +100,7 @@ def test_an_index_finds_the_same_centres(device, backend, kind, d, dtype):
 
 
 def leaf_beside(corner, sign=1.0):
-    """Returns 16 centres: the corner, and others that are behind it in every coordinate, in the sign's direction."""
+    """Returns 16 centres: ``corner``, and 15 beyond it in every coordinate, in the direction of ``sign``."""
     return corner + sign * torch.rand(16, *corner.shape) * (torch.arange(16) > 0)[:, None]
 
 
@@ -108,7 +108,7 @@ def leaf_beside(corner, sign=1.0):
 def test_an_index_searches_every_box_within_rounding_of_the_bound(device, backend, d):
     """The distances of a box and of the centre at its corner are equal, so that rounding alone decides on the box.
 
-    Every point follows a centre, whose distance is the bound of the point's search.
+    Before each point, a point at a centre is searched; the distance of this centre bounds the next search.
     """
     first, wide = 0.5 + torch.rand(d) / 2, 6.0 * torch.randint(0, 2, (16, d)) - 3
     wide[:, 0] = torch.linspace(-8, 0.9, 16)  # this box contains all points, but its centres are farther
@@ -149,7 +149,7 @@ def test_an_index_searches_every_box_within_rounding_of_the_bound(device, backen
     ids=["2", "3", "4"],
 )
 def test_the_largest_rounding_of_float32_is_within_the_margin(device, backend, point, near, far):
-    """In float32 the nearer centre is 3.4e-7 of the distance farther: the worst of ten million random cases."""
+    """In float32, the nearer centre seems farther by 3.4e-7 of the distance, the worst of ten million random cases."""
     for nearest, centres in enumerate(([near, far], [far, near])):
         arguments = torch.tensor([point], device=device), torch.tensor(centres, device=device)
         for index in (None, index_centres(arguments[1])):

@@ -80,7 +80,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         results.append(method)
         return route(self, method, *args, **kwargs)
 
-    for name in ("_route_as_it_is", "_route_uncompiled"):  # the second applies once torch's compiler is imported
+    for name in ("_route_as_it_is", "_route_uncompiled"):  # the second runs calls once torch's compiler is imported
         monkeypatch.setattr(VoronoiRouter, name, noted)
     return results
 
@@ -284,7 +284,7 @@ def test_methods_share_the_cells_that_were_drawn(calls: list[str]) -> None:
 )
 @pytest.mark.parametrize("inside", [False, True])
 def test_methods_find_new_cells_after_a_write_to_the_centres(change: Callable[[Tensor], Any], inside: bool) -> None:
-    """Also a write that no version counter counts, and a write to centres of inference mode."""
+    """Even a write that no version counter counts, or to centres made in inference mode, is noticed."""
     router, x = routed(Named(), methods=["density"]), rows(64)
     with torch.no_grad():
         router.module.layer.bias.add_(torch.arange(router.num_cells)[:, None])

@@ -92,7 +92,7 @@ CHANGES: dict[str, Callable[[VoronoiRouter], VoronoiRouter]] = {
 
 
 def train(router: VoronoiRouter) -> None:
-    """Makes a step of an optimiser for each method; compares the results with the loop over masks, if it is short."""
+    """Makes an optimiser's step for each method; for fewer than 50 cells, compares it with the loop over masks."""
     optimizer, x = torch.optim.Adam(router.parameters()), points(60)
     router.unfreeze()
     for method in (*router.methods, "forward", *router.methods):
@@ -154,7 +154,7 @@ def test_uses_after_inference_mode(name: str, change: str) -> None:
 
 @pytest.mark.parametrize("name", ["fused", "grouped"])
 def test_labels_of_methods_are_not_the_callers(name: str) -> None:
-    """Labels that the caller overwrites after a call change the cells of a next method only if it gets them."""
+    """Labels that the caller overwrites after a call affect the next method only if they are passed to it."""
     options: Any = {"fuse": True} if name == "fused" else {"way": "grouped"}
     router, x = VoronoiRouter(Heads(), 3, methods=["density"], **options), points(60)
     with torch.no_grad():

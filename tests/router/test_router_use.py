@@ -96,7 +96,7 @@ OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_children_step_as_their_parent_would(generator: torch.Generator, name: str) -> None:
-    """After a split that moves no sample, optimiser steps are those without the split, from divided moments."""
+    """After a split that moves no sample, a step equals the step without the split if moments are divided."""
     x = uniform(generator, 200, 3)
     router = router_of(LearnedSine(), generator, k=2)
     router.module.b.requires_grad_(False)
@@ -183,7 +183,7 @@ def test_children_share_the_moments_of_their_parent(generator: torch.Generator) 
     before = [{key: value.clone() for key, value in state.items()} for state in optimizer.state.values()]
     router.subdivide(3, points=uniform(generator, 90, 3), cells=[1], optimizer=optimizer)
     for old, state in zip(before, optimizer.state.values(), strict=True):
-        for key in ("exp_avg", "exp_avg_sq"):  # of squares, too: the variance of three parts is a third
+        for key in ("exp_avg", "exp_avg_sq"):  # squares, too: a third of the samples has a third of the variance
             torch.testing.assert_close(state[key], torch.stack([old[key][0], *[old[key][1] / 3] * 3]))
         assert state["step"] == old["step"]
 

@@ -85,12 +85,12 @@ def leads_outside(path: Path, folder: Path) -> bool:
 
 
 def cache_folder() -> Path:
-    """Returns the cache folder: VORONERF_CACHE, or `voronerf` in the user's caches.
+    """Returns the cache folder: VORONERF_CACHE, or `voronerf` in the user's folder for caches.
 
-    For a user without a home folder, as in some containers, it is a private folder beside the system's temporary files.
+    A user without a home folder, as in some containers, gets a private folder beside the system's temporary files.
 
     Raises:
-        OSError: When this private folder belongs to another user or cannot be made.
+        OSError: When the private folder belongs to another user or cannot be made.
     """
     caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     folder = os.path.expanduser(os.environ.get("VORONERF_CACHE") or os.path.join(caches, "voronerf"))

@@ -123,7 +123,7 @@ class Run:
         Args:
             views: Number of test views, evenly spaced; None for all.
             lpips: The LPIPS network, or the weights for :meth:`find_lpips`.
-            track: Function that shows progress: it yields the items of a sequence, and takes the sequence's name.
+            track: Function that shows progress: takes a sequence and the task's name, and yields the items.
 
         Returns:
             A dict with the mean "psnr" in dB, "ssim" and "lpips" (None without weights), "psnr_of_mean_error",

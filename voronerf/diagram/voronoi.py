@@ -97,7 +97,7 @@ class VoronoiDiagram(nn.Module):
 
     def _set_tables(self, centres: Tensor, child_offsets: Tensor, child: Tensor) -> None:
         self.depth, self.num_cells = _check_tree(centres, child_offsets, child)
-        with torch.inference_mode(False):  # no training could use tables of inference mode
+        with torch.inference_mode(False):  # a training could not use inference tensors
             for name, table in zip(("centres", "child_offsets", "child"), (centres, child_offsets, child)):
                 self.register_buffer(name, table.clone() if table.is_inference() else table)
 
@@ -272,12 +272,12 @@ class VoronoiDiagram(nn.Module):
         return kept[1]
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes the index of the centres for a recorded training step, which is recorded again when centres change."""
+        """Adds the index of the centres to a recorded training step's dependencies: a change causes a new recording."""
         noted.answer(self.index)
         return ()
 
     def snapshot(self) -> Values:
-        """Returns an object that is replaced by another one when centres have changed, for caches.
+        """Returns a key for caches: an object that is replaced by another one when the centres have changed.
 
         On the CPU, all values are compared (12 bytes per centre). On a GPU, only the version counter and the address
         are compared, to avoid a wait for the device.

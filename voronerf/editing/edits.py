@@ -283,10 +283,10 @@ def _corners(box: Tensor | None) -> Tensor:
 
 
 def _join_views(views: Sequence[tuple[tuple[str, str], Split, Similarity]]) -> Split:
-    """Joins the cameras of several splits, without images; each split comes with the name of its scene and its place.
+    """Joins the cameras of several splits, without images; ``views`` has each split with its scene and its place.
 
-    A view counts once if its name repeats in one scene and place. If names repeat otherwise, all names get the number
-    of their scene as a prefix.
+    Of views with the same name, scene and place, only the first is kept. If names still repeat, all names get the
+    number of their scene as a prefix.
     """
     cameras, names = list[Cameras](), dict[tuple[str, str], dict[str, None]]()
     for place, split, frame in views:
@@ -384,7 +384,7 @@ def cut_source(source: RunContents, keep: Solid | Tensor) -> RunContents:
     A contraction is the identity inside its sphere, so a source cut inside the sphere needs no contraction.
 
     Args:
-        source: The source, of any kind.
+        source: The source.
         keep: A solid in the scene, or bool [k], a mask of cells.
     """
     parts, box = source.parts, source.scene.box

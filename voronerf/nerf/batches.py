@@ -29,8 +29,8 @@ class RaySource(Protocol):
     """A source of training rays; a `TrainingStep` calls it once at the start of each step.
 
     Attributes:
-        device: The device of its rays.
-        ranks: A `Ranks`, set by a `TrainingStep` with several processes: each should draw other rays.
+        device: The device of the rays.
+        ranks: A `Ranks`, set by a `TrainingStep` with several processes: each process should draw different rays.
 
     Examples:
         >>> import torch
@@ -72,7 +72,7 @@ class RayBatches:
         near: The distance along a ray at which the scene begins.
         far: The distance along a ray at which the scene ends.
         box: [2, 3], the box of the scene; None for no box.
-        region: [2, 3], a box that the rays must meet, too; None for none. Rays are not cut to it.
+        region: [2, 3], a box that the rays must meet, too; it does not change their near and far. None for no such box.
         background: [3], the colour behind the scene; None for black.
         random_background: Whether to draw a background colour for each ray, for images with alpha, and for opaque
             images if ``background`` is None. A translucent surface then never has the right colour, so surfaces learn
@@ -164,7 +164,7 @@ class RayBatches:
         return self.images.numel() // self.images.shape[-1]
 
     def __len__(self) -> int:
-        """Returns the number of rays to draw from."""
+        """Returns the number of pixels that rays are drawn from."""
         return self._pixel_count if self.useful is None else self.useful.total
 
     def stop_unseen_rays(self) -> None:

@@ -139,7 +139,7 @@ class Perspective:
         return torch.cat((across, 1 - 2 * self.near / depth), dim=-1)
 
     def inverse(self, points: Tensor) -> Tensor:
-        """Returns the world points [..., 3] of contracted points [..., 3]; at most 2,000 near depths away."""
+        """Returns the world points [..., 3] of contracted points [..., 3]; depths are at most 2,000 ``near``."""
         depth = 2 * self.near / (1 - points[..., 2:]).clamp_min(1e-3)
         across = points[..., :2] * depth * depth.new_tensor(self.slopes)
         return torch.cat((across, depth), dim=-1) @ self.axes.to(points) + self.centre.to(points)

@@ -1,9 +1,9 @@
 """Data-parallel training by `torch.distributed`: several processes hold the same networks and average their gradients.
 
 Each process (rank) draws its own rays. Ranks exchange gradients and the loss in each step, the occupancy grid after
-each `GROUP` of steps, and kept samples before a split. All other decisions follow from these numbers, from numbers of
-rank 0, and from one random generator. So the networks of all ranks stay equal to the bit, if their processors are of
-one kind.
+each `GROUP` of steps, and kept samples before a split. All other decisions follow from the exchanged values, from
+values of rank 0, and from a random generator that is equal on all ranks. So the networks of all ranks stay equal to the
+bit, if their processors are of the same model.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 T = TypeVar("T")
-#: Tensors with fewer numbers are copied into one message; larger ones are sent from where they are.
+#: Tensors with fewer elements are copied into one message; larger contiguous tensors are sent without a copy.
 SMALL = 1 << 15
 #: Difference between the seeds of the rays of two ranks.
 STRIDE = 1_000_003
@@ -32,7 +32,7 @@ class PeerLost(RuntimeError):
 
 @dataclass(frozen=True)
 class Ranks:
-    """The processes of a data-parallel training; for a single process, all methods return their input.
+    """The processes of a data-parallel training; for a single process, no method changes its input.
 
     Attributes:
         rank: The number of this process, 0..size - 1.
@@ -127,7 +127,7 @@ ALONE = Ranks()
 
 
 def _leave() -> None:
-    """Ends the threads of the group before Python ends: one that frees a tensor after that would abort the process."""
+    """Ends the process group's threads before Python exits, since a later free of a tensor would abort the process."""
     if dist.is_initialized():
         dist.destroy_process_group()
 

@@ -92,7 +92,7 @@ class RayLoss:
         return output
 
     def stages(self, generator: torch.Generator | None, backward: bool) -> list[Stage]:
-        """Returns the parts of a training step that compute the loss ("output") of the rays ("batch").
+        """Returns the stages of a training step that compute the result "output" (`RenderOutput`) of the rays "batch".
 
         Args:
             generator: Random generator of the samples.

@@ -52,11 +52,11 @@ class Radiance(NamedTuple):
     networks: Networks
 
     def network(self, program: Program) -> Network:
-        """Returns the networks of one of the programs of `Networks`."""
+        """Returns a callable network: one of the programs of `Networks` with the parameters of all cells."""
         return Network(program, self.cells.parameters)
 
     def rows(self, inputs: Tensor, directions: Tensor, ray_index: Tensor) -> dict[str, Any]:
-        """Returns the arguments with which a network evaluates samples, by name."""
+        """Returns the arguments, by name, with which the result of :meth:`network` evaluates samples."""
         cells = self.router.places(inputs)
         if self.networks.program.rays:
             return {"inputs": [inputs, directions], "cells": cells, "ray_index": ray_index}
@@ -72,7 +72,7 @@ class Radiance(NamedTuple):
         return density[:, 0].float()
 
     def note_dependencies(self, noted: Any) -> list[VoronoiRouter]:
-        """Notes that the programs and the parameters must stay the same."""
+        """Notes for a recorded step that it is valid only for the same programs and parameters; returns the router."""
         noted.answer(self._is_current)
         return [self.router]
 
@@ -148,7 +148,7 @@ def _networks(text: str, reads: tuple[int, ...], shapes: tuple[tuple[int, ...], 
 
 
 def _without_moves(program: Program) -> Program:
-    """Returns the program with its "move" steps bypassed: steps and outputs read the columns that a "move" copies.
+    """Bypasses the "move" operations of a program: other operations and outputs read the columns that a "move" copies.
 
     A "move" may join colour and density in one value. A program that read the density from this value would compute
     the colour too.

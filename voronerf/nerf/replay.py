@@ -28,7 +28,7 @@ MAX_BACKOFF = 64
 _REPLAYED = set[type]()
 _REGISTRIES = ("_parameters", "_buffers", "_modules")  # of modules
 _HOOKS = ("_backward_hooks", "_post_accumulate_grad_hooks")  # attributes of parameters
-#: Functions whose answers every recording depends on.
+#: Functions on whose results every recording depends.
 _QUESTIONS = (
     torch.is_grad_enabled,
     torch.are_deterministic_algorithms_enabled,
@@ -49,10 +49,10 @@ def replayed(kind: T) -> T:
 
     Its methods must compute only with ops and elementwise functions of torch, and data that changes from step to step
     must lie in tensors. Other Python code runs only once, while the step is recorded. All classes of this package are
-    marked. If an unmarked subclass, or an object itself, overrides a hook, this hook runs in Python in each step. If it
-    overrides another member that hooks may use, or if a subclass adds a property, all its hooks run in Python in each
-    step. A step detects changes of instance attributes, also within lists, tuples, dictionaries and dataclasses, but
-    not of class attributes.
+    marked. If an unmarked subclass, or an object itself, overrides a hook, this hook runs in Python in each step. If
+    the class or object overrides another member that hooks may use, or the class adds a property, all its hooks run in
+    Python in each step. A step detects changes of instance attributes, also within lists, tuples, dictionaries and
+    dataclasses, but not of class attributes.
 
     Examples:
         >>> from voronerf.nerf import SplitStrategy, replayed
@@ -126,8 +126,8 @@ class Stage(NamedTuple):
         uses: Function that returns the objects that the function uses. A replay depends on their attributes; a method
             ``note_dependencies`` of a class notes other dependencies, and returns further objects.
         python: Whether the function is called in each step; else it may be replayed.
-        lazy: Whether the function first takes a function that cuts recorded tensors to the rows of the present step. It
-            then gets its results uncut.
+        lazy: Whether the function takes recorded tensors with their spare rows and, as an additional first argument, a
+            function that cuts tensors to the rows of the present step.
         restore: Function of the stage's results, called after they have been replayed; None for none.
     """
 
@@ -141,7 +141,7 @@ class Stage(NamedTuple):
 
     @classmethod
     def of_hook(cls, part: Any, *hooks: str, function: Callable[..., Any], reads: tuple[str, ...]) -> Stage:
-        """Returns the stage of an object's hook, which runs in Python if one of ``hooks`` does."""
+        """Returns the stage of an object's hook; it runs in Python if `in_python` is true of one of ``hooks``."""
         python = any(in_python(part, hook) for hook in hooks)
         return cls(f"{type(part).__name__}.{hooks[0]}", function, reads, lambda: (part,), python)
 
@@ -210,7 +210,7 @@ class _Segment:
         return recorded._replace(times=completed)
 
     def may_record(self, earlier: Results) -> bool:
-        """Returns whether to make a recording, which happens less often the more of them are never replayed."""
+        """Returns whether to record this call; after each recording that is never replayed, more calls run eagerly."""
         if self.eager_calls or (earlier is not _NOTHING and earlier.recording is None):
             self.eager_calls = max(0, self.eager_calls - 1)
             return False

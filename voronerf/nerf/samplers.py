@@ -47,7 +47,7 @@ SETTLING_STEPS = 400
 #: The fraction of voxels that are evaluated at random before each `GROUP` of steps, and the maximum number of these
 #: voxels: about the number of samples of a few steps.
 REVISITED, MOST_REVISITED = 1 / 8, 32_768
-#: The fraction of occupied voxels above which the steps of a training have not emptied the box yet.
+#: Above this fraction of occupied voxels after a training, `Occupancy.finish` evaluates every voxel of a box.
 FULL = 0.5
 #: The number of strata per ray in pictures: the ratio to the number in training, and the maximum in a box and in
 #: contracted space. A training needs fewer strata, since its jittered samples cover each stratum over time. In a box,
@@ -92,7 +92,7 @@ class Sampler:
         samples: s, the number of samples per ray in the first pass.
         space: The coordinates in which rays are sampled and the field is evaluated.
         backend: The backend of the ops.
-        settling_steps: The number of training steps, at least, before the first update of the grid.
+        settling_steps: The minimum number of training steps before the first update of the grid.
 
     Args:
         samples: s, the number of samples per ray in the first pass, at least 1.
@@ -355,7 +355,7 @@ class Occupancy(Sampler):
 
     @property
     def settling_steps(self) -> int:  # type: ignore[override]
-        """The number of training steps, at least, before the first update of the grid."""
+        """The minimum number of training steps before the first update of the grid."""
         return SETTLING_STEPS if isinstance(self.grid.contraction, Contraction) else WARMUP_STEPS
 
     @property

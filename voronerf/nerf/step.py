@@ -83,7 +83,7 @@ class TrainingStep:
     without such hooks is captured in a CUDA graph after a warm-up step; a new number of rays needs a new capture.
 
     A step that cannot be replayed runs eagerly; :meth:`explain` tells why. One reason is a parameter that needs a
-    gradient but belongs to another optimiser. Changed attributes of the objects are detected, and so is a tensor that
+    gradient but belongs to another optimiser. Changed attributes of the arguments are detected, and so is a tensor that
     moves to other memory (``x.data = y``). After other changes inside an object, call :meth:`forget`. A copy of a step
     has recordings of its own; a shallow copy trains the same networks.
 
@@ -181,7 +181,7 @@ class TrainingStep:
             rays: The number of rays of each step.
             steps: The number of steps, at least 1.
             at: The number of steps done before. This method then also calls two hooks. It calls the sampler's
-                ``step_pre_backward`` before each step if there are user hooks, else before each run of steps; a run
+                ``step_pre_backward`` before each step if there are user hooks, else before each series of steps, which
                 ends after ``steps_per_update`` steps or at a multiple of `GROUP`. It calls the optimiser's
                 ``after_step`` after each multiple of `GROUP` steps. Both hooks are recorded, except a hook that must
                 run in Python (see `replayed`). None if the training loop calls both hooks itself.
@@ -221,7 +221,7 @@ class TrainingStep:
         return min(schedule.GROUP - at % schedule.GROUP, until_update)
 
     def _finish(self, at: int) -> None:
-        """Updates the averages of the weights after each `GROUP` of steps."""
+        """Counts steps; after each `GROUP`, calls the optimiser's ``after_step`` and merges the grids of all ranks."""
         self.optimizer.steps_done = self._done = at
         if at % schedule.GROUP == 0:
             self._after({})
@@ -262,7 +262,7 @@ class TrainingStep:
         return self, self.optimizer, self.guard, *self.loss.uses()
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes attributes for a recorded step, which is recorded again when they change.
+        """Notes attributes whose change makes a step be recorded again.
 
         See `voronerf.nerf.replay.Stage`.
         """
@@ -314,7 +314,7 @@ class TrainingStep:
 
     @property
     def _scaler(self) -> torch.amp.GradScaler | None:
-        """The GradScaler that scales the loss; None for no scaler, or one that is not used."""
+        """The GradScaler that scales the loss; None without autocast or an enabled scaler."""
         used = self.autocast is not None and self.scaler is not None and self.scaler.is_enabled()
         return self.scaler if used else None
 

@@ -27,7 +27,7 @@ _MANY = 4  # minimum number of cells for the warning that one cell has nearly al
 def with_labels(
     router: Any, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], coords: Tensor | None, cells: Any
 ) -> tuple[tuple[Any, ...], dict[str, Any], Tensor | Labels | None]:
-    """Returns the arguments of a call with ``cells``, and its labels; None if the method itself takes ``cells``."""
+    """Returns args, kwargs and the labels ``cells``; or ``coords``, if the method itself has an argument ``cells``."""
     names = router._argument_names.get(method, ())
     if coords is not None and "coords" in names:
         kwargs, coords = {**kwargs, "coords": coords}, None
@@ -112,7 +112,7 @@ def _check_positions(router: Any, positions: Tensor, source: Tensor | None, rule
 def _position_warning(coords: Any, source: Tensor | None, flat: Tensor, counts: Tensor, centres: Tensor) -> str:
     """Returns the reason why positions [n, d] may be another quantity, or an empty text.
 
-    ``source`` is the tensor in which ``coords`` finds them; ``counts`` [k] is the number of samples in each cell.
+    ``source`` is the tensor in which ``coords`` finds the positions; ``counts`` [k] are the samples in each cell.
     """
     k, d = len(counts), flat.shape[1]
     if isinstance(coords, str) and source is not None:

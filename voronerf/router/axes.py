@@ -1,7 +1,7 @@
 """The axis of samples of the tensors in a ``forward``.
 
-A size alone cannot tell whether it counts samples, since any other size may equal it. A module therefore runs with two
-numbers of samples: a size that counts samples is the same multiple of both numbers.
+One run cannot tell whether a size counts samples, since another size may have the same value. A module therefore runs
+with two numbers of samples: a size that counts samples is the same multiple of both numbers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Axis(NamedTuple):
 
 
 class SampleCount(int):
-    """A multiple of the number of samples among the arguments of a function."""
+    """An integer argument of a function that is a multiple of the number of samples, such as n in ``zeros(n, 4)``."""
 
 
 def multiple(sizes: Sequence[int], counts: Sequence[int]) -> int:
@@ -28,7 +28,7 @@ def multiple(sizes: Sequence[int], counts: Sequence[int]) -> int:
 
 
 def axis_of(shape: Sequence[int], other: Sequence[int], counts: Sequence[int]) -> Axis | None:
-    """Returns the axis of samples of a tensor from its shapes in two runs; None if not exactly one axis has samples."""
+    """Returns the axis of samples of a tensor from its shapes in two runs; None unless exactly one axis has samples."""
     if len(shape) != len(other):
         return None
     axes = [Axis(dim, m) for dim, sizes in enumerate(zip(shape, other)) if (m := multiple(sizes, counts))]

@@ -55,7 +55,7 @@ def call_key(method: str, training: bool, args: Sequence[Any], kwargs: dict[str,
 
 
 class CachedCall:
-    """The calls with one key as one program, made from the first of them.
+    """A program for all calls with one key, made from the first of these calls.
 
     Args:
         fused: The traced module.
@@ -78,14 +78,14 @@ class CachedCall:
         self._leading, device = len(call.layout.lead), grouping.device
         half = torch.is_autocast_enabled(device.type) or any(arguments[i].dtype in HALF for i in self._tensors)
         ones, self._result = 0 if call.layout.flat else self._leading - 1, fused.result
-        # The program returns float32 [n, w]. None: all results keep this shape, or this dtype.
+        # Programs give float32 [n, w]. `_tails` is None if all results have this shape, `_dtypes` if all are float32.
         is_flat = self._leading == 1 and all(len(shape) == 1 for shape, _ in results)
         self._tails = None if is_flat else [shape[ones:] for shape, _ in results]
         dtypes = [dtype if half and dtype in HALF else torch.float32 for _, dtype in results]
         self._dtypes = None if {*dtypes} == {torch.float32} else dtypes
         self._fused, self._program, self._is_compilable = fused, program, not fused.computes
         fused.parameters(grouping.k, device, grouping.backend)  # fills a cached property, which torch.compile cannot
-        self._made = cast("tuple[Any, Network | None]", (Stale(), None))  # dependencies and the network made with them
+        self._made = cast("tuple[Any, Network | None]", (Stale(), None))  # what the network depends on, and the network
 
     @staticmethod
     def of(fused: Fused, watch: Watch, most: int, call: Call, grouping: Grouping) -> CachedCall | None:
@@ -127,10 +127,10 @@ class CachedCall:
         return rebuild(self._result, results)
 
     def _network(self, router: Any, device: torch.device, compiles: bool) -> Network:
-        """Returns the network, which is made again only for other parameters than in the last call."""
+        """Returns the network of the last call; makes a new one if parameters have changed, or during compilation."""
         same, network = self._made
         if compiles or network is None or not same.holds():
-            same = None if compiles else self._fused.same_parameters()  # noted first: another thread may assign some
+            same = None if compiles else self._fused.same_parameters()  # first, since another thread may assign some
             parameters = self._fused.parameters(router.num_cells, device, router.backend)
             network = Network(self._program, parameters, names=_NAMES)
             if not compiles and not isinstance(same, Stale):

@@ -59,7 +59,7 @@ def _named(name: str, part: nn.Module) -> str:
 
 
 def detach_results(module: nn.Module, memo: dict[int, Any]) -> None:
-    """Adds detached copies of the results that a module keeps to the memo of ``copy.deepcopy``."""
+    """Adds to ``memo``, for ``copy.deepcopy``, a detached copy of each result of a call that the module keeps."""
     for part in module.modules():
         for item in reachable(vars(part)):
             if isinstance(item, Tensor) and not item.is_leaf:
@@ -85,7 +85,7 @@ def check_module(module: nn.Module) -> None:
 
 
 def hide_parts(module: nn.Module) -> None:
-    """Notes which attributes hold parameters or submodules (HOLDERS), and submodules that only these hold (HIDDEN)."""
+    """Stores the names of attributes that hold parameters or submodules (HOLDERS), and unregistered parts (HIDDEN)."""
     registered, waiting = set(map(id, module.parameters())), list(parts_of(module).values())
     while waiting:
         part, known = waiting.pop(), parts_of(module)
@@ -253,14 +253,14 @@ def _difference(ours: nn.Module, theirs: nn.Module, seen: dict[int, Any] | None 
 
 
 def _class_of(value: Any) -> tuple[str, str]:
-    """Returns the name of a class; torch and factories make classes of one name anew for each object."""
+    """Returns module and name of a value's class; the class itself may differ, as factories make one per object."""
     return type(value).__module__, type(value).__qualname__
 
 
 def _attributes(part: nn.Module) -> dict[str, Any]:
-    """Returns the attributes of a submodule by which its results may differ, without its state and its parts.
+    """Returns the attributes that may change a submodule's results, except its ``state_dict`` and its submodules.
 
-    Weight norm and pruning compute an attribute such as ``weight`` from parameters such as ``weight_v``.
+    Also excludes attributes that weight norm or pruning computes, such as ``weight`` from ``weight_v``.
     """
     computed = {name.rpartition("_")[0] for name in part._parameters}
     members = {name: value for name, value in vars(part).items() if name not in _PRIVATE and name not in computed}
@@ -269,7 +269,7 @@ def _attributes(part: nn.Module) -> dict[str, Any]:
 
 
 def _same(a: Any, b: Any, seen: dict[int, Any]) -> bool:
-    """Returns whether two attributes are equal; parameters, and tensors that a call has left there, equal any value."""
+    """Returns whether two attributes are equal. Parameters, and tensors that a call has computed, equal any value."""
     if a is b or any(isinstance(x, Tensor) and (x.requires_grad or not x.is_leaf) for x in (a, b)):
         return True
     if isinstance(a, Number) and isinstance(b, Number):
@@ -301,7 +301,7 @@ def _equal(a: Any, b: Any) -> bool:
 def _parts(value: Any, other: Any) -> list[Any] | None:
     """Returns the objects that define a function, a container or an object; None for a value that compares itself.
 
-    A call may have left tensors in one of two containers, under further keys or at the end; these do not count.
+    Tensors that a call may have added to only one of the containers, under further keys or at the end, are left out.
     """
     if isinstance(value, types.FunctionType):
         options, cells = value.__kwdefaults__ or {}, value.__closure__ or ()
@@ -319,7 +319,7 @@ def _parts(value: Any, other: Any) -> list[Any] | None:
     if (slots or hasattr(value, "__dict__")) and not isinstance(value, type):
         return [getattr(value, "__dict__", None), *(getattr(value, name, None) for name in slots)]
     compares = callable(value) or type(value).__dict__.get("__eq__", object.__eq__) is not object.__eq__
-    return None if compares else []  # an object without attributes, such as a lock, tells nothing
+    return None if compares else []  # an object without attributes, such as a lock, equals others
 
 
 def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:

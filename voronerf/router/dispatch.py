@@ -50,7 +50,7 @@ _LIBRARY_FOLDERS = tuple(
 
 
 class _Checked(NamedTuple):
-    """The parameters at the last check, replaced as a whole since other threads may read it.
+    """The last check of parameters, replaced as a whole since other threads may read it.
 
     Attributes:
         k: The number of cells.
@@ -211,14 +211,14 @@ class Dispatch:
         return plain
 
     def find(self, key: Any, compiles: bool) -> CachedCall | None:
-        """Returns the cached call of a key; None if its dependencies have changed (not asked during compilation)."""
+        """Returns a cached call; None if dependencies changed or transforms are active (unchecked in compilation)."""
         cached = self.cached.get(key)
         if cached is None or compiles:
             return cached
         return cached if not is_intercepted() and cached.dependencies.holds() else None
 
     def _check_parameters(self, call: Call, k: int, names: Collection[str]) -> _Checked:
-        """Raises TypeError if the module lacks parameters, and ValueError if stacked ones are not [k, ...].
+        """Raises TypeError if the module lacks parameters, and ValueError if stacked parameters are not [k, ...].
 
         With a parametrisation or another shape, kernels would access memory outside of the parameters.
         """
@@ -247,7 +247,7 @@ class Dispatch:
         return checked
 
     def _plan(self, call: Call, grouping: Grouping, options: Options) -> CallPlan:
-        """Returns the plan for calls like this one; the first one, or one with changed constants, makes a plan."""
+        """Returns the plan for a call; makes a plan for the first call of a kind, and if constants have changed."""
         layout, key = call.layout, _plan_key(call, grouping.device)
         constants, few = call.constants() if options.fuse else {}, layout.n < FEWEST
         plans = [plan for plan in self.plans.get(key, []) if few or not plan.small]
@@ -327,7 +327,7 @@ class Dispatch:
         way, loop = plan.way, plan.loop
         latest, warns = self._latest_ways.setdefault(call.method, {}), way is loop
         if plan.skip:
-            plan.skip = max(plan.skip - (not hooked()), 0)  # another thread may have counted it
+            plan.skip = max(plan.skip - (not hooked()), 0)  # another thread may have lowered it
             way = loop
         why = way.why
         if isinstance(way, Fused) or (isinstance(way, Grouped) and grouping.k > 1):
@@ -365,7 +365,7 @@ class Dispatch:
         return results
 
     def _run_once(self, way: Fused | Grouped, call: Call, grouping: Grouping) -> Results:
-        """Runs a call for all cells at once; if a grouped module does something new, its steps are recorded again."""
+        """Runs a call for all cells at once; if a grouped module calls other functions than before, records them."""
         try:
             return way.run(call, grouping)
         except Ungroupable as error:

@@ -45,7 +45,7 @@ class Double:
 
     Attributes:
         stacked: The stacked parameters of the module, without those that cells share, by id.
-        assigned: The numbers among the attributes that runs have assigned, with the values that were dropped.
+        assigned: Numbers that runs assigned to attributes and dropped, by (index of the submodule, name).
         writes: With ``reads``, the file and line of the first assignment to each attribute that was read before.
     """
 
@@ -83,7 +83,7 @@ class Double:
             self._containers += [members[name] for name in members.get(CHANGES, ()) if name in members]
             if part._buffers:  # a buffer that ``forward`` assigns must not reach the next cell
                 self._containers.append(members["_buffers"])
-            if isinstance(part, nn.RNNBase):  # it would move the weights of cells to other memory
+            if isinstance(part, nn.RNNBase):  # flatten_parameters would move the cells' weights
                 members["flatten_parameters"] = _nothing
             vars(twin).update(members)
             if not type(part).__module__.startswith(_LAYERS) or part._forward_pre_hooks or isinstance(part, nn.RNNBase):
@@ -97,17 +97,17 @@ class Double:
             self._registries.append((twin, registry, set(registry)))
 
     def run(self, call: Call, rows: Iterable[Tensor], values: Mapping[int, Any] | None = None, mode: Any = None) -> Any:
-        """Runs a call once; see :meth:`runs`. Without ``values`` the parameters are the first cell's, as constants."""
+        """Runs a call once; see :meth:`runs`. Without ``values``, the parameters are constants: the first cell's."""
         values = {key: p.detach()[0] for key, p in self.stacked.items()} if values is None else values
         return self.runs(call, [rows], [values], mode)[0]
 
     def runs(
         self, call: Call, parts: Iterable[Iterable[Tensor]], values: Iterable[Mapping[int, Any]], mode: Any = None
     ) -> list[Any]:
-        """Runs a call for each part of the rows, with ``values``, by parameter id, as its parameters.
+        """Runs a call for each part of the rows, each with one item of ``values`` as the parameters, by id.
 
-        The values of one parameter are parts of one tensor. The PyTorch function mode ``mode``, if any, is active only
-        while the method runs.
+        All values of a parameter must be slices of one tensor, so that they share its version counter. The PyTorch
+        function mode ``mode``, if any, is active only while the method runs.
 
         Raises:
             Forbidden: If the method adds, removes or replaces parameters, or writes into them.
@@ -266,7 +266,7 @@ def _nothing() -> None:
 
 
 def items_of(containers: Iterable[Any]) -> list[tuple[Any, Any]]:
-    """Lists (container, copy) of lists, dicts and sets, and of those in them."""
+    """Lists (container, copy) for all lists, dicts and sets, including nested ones."""
     pending, items = list(containers), dict[int, tuple[Any, Any]]()
     while pending:
         container = pending.pop()
@@ -277,14 +277,14 @@ def items_of(containers: Iterable[Any]) -> list[tuple[Any, Any]]:
 
 
 def restore_items(items: list[tuple[Any, Any]]) -> None:
-    """Gives containers the items that they had in :func:`items_of`."""
+    """Restores containers from the copies of :func:`items_of`."""
     for container, copied in items:
         container.clear()
         container.extend(copied) if isinstance(container, list) else container.update(copied)
 
 
 def moved(value: Any, twins: Mapping[int, Any]) -> Any:
-    """Returns the value with its submodules and tensors replaced by their twins, by id."""
+    """Returns the value with submodules and tensors replaced by the ``twins`` of their ids."""
 
     def change(name: str, leaf: Any, nested: bool) -> Any:
         if isinstance(leaf, (nn.Module, Tensor)):

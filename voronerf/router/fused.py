@@ -1,9 +1,9 @@
 """Fuses a module whose ``forward`` is fixed: its functions become one program, or several programs.
 
 The module is traced once (:mod:`voronerf.router.trace`). Functions that can be steps of a program (``router/lower.py``)
-are joined into the largest possible runs, and each run is one operation. Functions between runs, such as look-ups, run
-in PyTorch for the rows of all cells at once. Functions between runs that take parameters of cells run by the rules of
-:mod:`voronerf.router.rules`.
+are joined into the largest possible subprograms, each of which is one operation; messages call them "runs". Functions
+between subprograms, such as look-ups, run in PyTorch for the rows of all cells at once, or by the rules of
+:mod:`voronerf.router.rules` if they take parameters of cells.
 
 Letters: n samples, k cells, w columns.
 """
@@ -32,7 +32,7 @@ from voronerf.router.trace import CELLS, SAMPLES, Trace, Unfusable, differentiab
 from voronerf.router.watch import Inputs, lookup
 from voronerf.router.waves import with_encodings
 
-HALF = (torch.bfloat16, torch.float16)  # a run computes these dtypes in float32, and rounds at its end
+HALF = (torch.bfloat16, torch.float16)  # programs compute these dtypes in float32, and round their results
 
 
 class ParameterEntries:
@@ -75,7 +75,7 @@ class Subprogram:
     """Adjacent steps as one program, with its outputs and with the tensors that its inputs and parameters read."""
 
     program: Program
-    inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier runs
+    inputs: list[Any] = field(default_factory=list)  # nodes, or values of earlier subprograms
     parameters: list[ParameterEntries] = field(default_factory=list)
     outputs: list[Any] = field(default_factory=list)
 
@@ -89,10 +89,10 @@ class WholeProgram(NamedTuple):
 
 
 class Fused:
-    """A call of the routed module as runs of programs with PyTorch functions between them.
+    """A call of the routed module as subprograms with PyTorch functions between them.
 
     The call is traced on rows of its arguments (:class:`voronerf.router.trace.Trace`). Raises :class:`Unfusable` if
-    nothing can be fused, or if a step cannot be repeated for other samples.
+    nothing can be fused, or if a function cannot be repeated for other samples.
 
     Attributes:
         inputs: The numbers and buffers that are looked up in each call.
@@ -113,7 +113,7 @@ class Fused:
         self._differentiates = any(node.target is torch.autograd.grad for node in trace.graph.nodes)
         self._lowering = Lowering(trace.rows)
         self._entries: dict[fx.Node, Entries] = {}  # entries of each value that steps compute or move
-        self._ready: dict[fx.Node, int] = {}  # the first run that can read each value from PyTorch
+        self._ready: dict[fx.Node, int] = {}  # for values of PyTorch: the first subprogram that can read it
         self._reasons: dict[fx.Node, str] = {}
         for node in trace.graph.nodes:
             self._add(node)
@@ -128,7 +128,7 @@ class Fused:
                     "write it with functions of PyTorch"
                 )
         self._writes = any(node.meta.get("inplace") for node in self._between)
-        if not self._writes:  # results of runs are contiguous, so PyTorch's view of such a result may need a copy
+        if not self._writes:  # subprograms give contiguous results, of which a view may need a copy
             for node in self._between:
                 if node.target is Tensor.view and not isinstance(node.args[1], torch.dtype):
                     node.target = Tensor.reshape
@@ -154,7 +154,7 @@ class Fused:
     # Cutting ----------------------------------------------------------------------------------------------------------
 
     def _add(self, node: fx.Node) -> None:
-        """Decides whether a node is computed by steps, or by PyTorch between runs."""
+        """Decides whether a node is computed by steps, or by PyTorch between subprograms."""
         if node.meta["on"] != SAMPLES or node.op == "placeholder" or isinstance(node.meta.get("value"), int):
             self._ready[node] = 0
             return
@@ -185,7 +185,7 @@ class Fused:
         return values <= self._lowering.sources.keys() or all(isinstance(s.meta.get("value"), int) for s in sources)
 
     def _at(self, node: fx.Node) -> int:
-        """Returns the number of the first run that can read a value."""
+        """Returns the number of the first subprogram that can read a value."""
         if node in self._ready:
             return self._ready[node]
         return max(map(self._lowering.level, self._lowering.values(self._entries[node].codes)), default=-1) + 1
@@ -228,7 +228,7 @@ class Fused:
         # A plain dict, because map_tensors makes its result of the same type, and map_arg returns an immutable dict.
         result, args, entries = self._lowering.run(function, args, dict(kwargs), entries_of)
         entry_list = [entries(tensor) for tensor in ([args[0]] if written else tensors_of(result))]
-        if written:  # the codes of views of the tensor change too
+        if written:  # the write changed these codes in place, for views too
             self._entries[written] = old_entries
         # The codes of a view of an argument share memory with the codes of the argument, so their strides stay.
         memory = {source.meta["value"].untyped_storage().data_ptr() for source in values.values()}
@@ -285,7 +285,7 @@ class Fused:
         return columns if columns.index not in self._lowering.sources else self._lowering.builder.apply("copy", columns)
 
     def _cut(self) -> dict[int, Subprogram]:
-        """Returns the runs of steps, by number; the level of a step is the number of its run."""
+        """Returns the subprograms, by number; the level of a step is the number of its subprogram."""
         lowering, steps = self._lowering, self._lowering.builder.steps
         live = self._live
         level = {value: lowering.level(value) for value in live}
@@ -300,7 +300,7 @@ class Fused:
                     outputs.append(node)
                     operands.append(columns)
             runs[number] = run = _renumbered(chosen, operands, lowering, outputs)
-            if not run.inputs:  # constants: an argument tells the number of samples
+            if not run.inputs:  # only constants; reads an argument for its number of rows
                 run.inputs = self._inputs[:1]
                 width = self._inputs[0].meta["value"].numel() // lowering.rows
                 run.program = replace(run.program, inputs=(width,))
@@ -309,7 +309,7 @@ class Fused:
     # Running ----------------------------------------------------------------------------------------------------------
 
     def run(self, call: Call, grouping: Grouping) -> Results:
-        """Returns the method's results. The rows are sorted by cell only if a function between runs needs it."""
+        """Returns the method's results. Rows are sorted by cell only if a function between subprograms needs it."""
         sort = self._sorted or grouping.rows is not None or not call.layout.n
         call = self._with_inputs(call, grouping.device)
         rows, shared = call.arranged(grouping if sort else None), call.shared()
@@ -332,7 +332,7 @@ class Fused:
 
     @functools.cached_property
     def whole_program(self) -> WholeProgram | str:
-        """The call as one program on its unchanged arguments, or the reason why there is none."""
+        """The program that computes the call without rearranging arguments or results, or why there is none."""
         if self.name != "fused":
             return self.why
         (run,) = self._runs.values()
@@ -363,7 +363,7 @@ class Fused:
 
     @functools.cached_property
     def _sources(self) -> list[tuple[dict[str, Any], str, ParameterEntries | None]]:
-        """(registry, name, selected entries or None for all) of each parameter of :attr:`whole_program`."""
+        """The source of each parameter of :attr:`whole_program`: (registry, name, selected entries or None for all)."""
         (run,) = self._runs.values()
         sources = list[tuple[dict[str, Any], str, ParameterEntries | None]]()
         for entries in run.parameters:
@@ -377,7 +377,7 @@ class Fused:
         return sources
 
     def same_parameters(self) -> Any:
-        """Returns dependencies (`voronerf.ops._core.unchanged`): the tensors that :meth:`parameters` returns now.
+        """Returns dependencies (`voronerf.ops._core.unchanged`) that hold while :meth:`parameters` returns the same.
 
         Returns `Stale` if the tensors are computed, in this module or by the caller of ``torch.func.functional_call``.
         """
@@ -474,7 +474,7 @@ def _renumbered(steps: list[Step], results: list[Columns], lowering: Lowering, o
     def columns(c: Columns) -> Columns:
         if c.of != VALUE:
             return c._replace(index=parameter(c.index))
-        if c.index not in values:  # computed before this run
+        if c.index not in values:  # computed before this subprogram
             values[c.index] = b.input(lowering.builder.steps[c.index].width).index
             run.inputs.append(lowering.sources.get(c.index, c.index))
         return c._replace(index=values[c.index])
@@ -527,7 +527,7 @@ def _compute(node: fx.Node, values: dict[Any, Any], grouped: GroupedRun) -> None
 
 
 def _flat(value: Tensor, n: int, source: Any) -> Tensor:
-    """Reshapes the value of a node, or of an earlier run, to [n, w]."""
+    """Reshapes the value of a node, or of an earlier subprogram, to [n, w]."""
     dim = source.meta["axis"].dim if isinstance(source, fx.Node) else 0
     value = value.movedim(dim, 0) if dim else value
     return value.reshape(n, -1) if n else value.reshape(0, max(value.shape[1:].numel(), 1))

@@ -78,7 +78,7 @@ _TO = find("to type_as", torch.Tensor)
 
 
 def converted(func: Any, args: Any) -> tuple[Any, Any]:
-    """Returns a conversion to another tensor's dtype and device as a conversion that does not take that tensor."""
+    """Replaces ``x.to(other)`` by ``x.to(device, dtype)``, which takes no other tensor; returns function, arguments."""
     if func in _TO and len(args) > 1 and isinstance(args[1], Tensor):
         return torch.Tensor.to, (args[0], args[1].device, args[1].dtype, *args[2:])
     return func, args
@@ -88,7 +88,7 @@ class Exact(TorchFunctionMode):
     """A mode that replaces functions whose higher derivatives are wrong in PyTorch.
 
     Attributes:
-        met: Whether one of these functions was called.
+        met: Whether a replaced function was called.
     """
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class Ungroupable(Exception):
 
     Attributes:
         of_batch: Whether another batch may be groupable.
-        is_new: Whether the module called functions that no :class:`CallAxes` describes, so a new record may help.
+        is_new: Whether the module called functions that no :class:`CallAxes` describes, so recording again may help.
     """
 
     def __init__(self, reason: str, of_batch: bool = False, is_new: bool = False) -> None:
@@ -277,10 +277,11 @@ def text_of_line(file: str, number: int) -> str:
 
 
 class CallAxes(NamedTuple):
-    """One function that a module calls: the axes of the tensors among its arguments and among its results.
+    """A recorded function call of a module, with the axis of samples of each tensor among its arguments and results.
 
-    ``integers`` are the integers among its arguments, and ``counts`` has the multiple of n of each that counts samples.
-    ``varies`` tells whether another size of its arguments depends on n without being a multiple of it.
+    ``integers`` are the integers among its arguments, with 0 for an integer that counts samples. ``counts`` has the
+    multiple of n of each integer, 0 if it counts no samples; empty if none does. ``varies`` tells whether another size
+    or integer among the arguments depends on n.
     """
 
     function: Any
@@ -305,7 +306,7 @@ def integers_of(items: Iterable[Any]) -> list[int]:
 
 
 def with_counts(value: Any, counts: Iterator[int]) -> Any:
-    """Returns arguments in which the integers with a multiple in ``counts`` are a :class:`SampleCount`."""
+    """Returns arguments in which each integer with a multiple in ``counts`` other than 0 is a :class:`SampleCount`."""
     if isinstance(value, int):
         return SampleCount(value) if next(counts) else value
     if type(value) in (list, tuple, torch.Size):
@@ -334,7 +335,7 @@ class Recorder(TorchFunctionMode):
 
 
 def steps_of(runs: Sequence[Recorder], n: Sequence[int]) -> list[CallAxes]:
-    """Returns the steps of a module from two runs with different numbers of samples ``n``.
+    """Returns the function calls of a module, from its runs with the two numbers of samples ``n``.
 
     Raises :class:`Ungroupable` if the runs call different functions.
     """
@@ -358,7 +359,7 @@ class GroupedRun(TorchFunctionMode):
         grouping: The samples by cell.
         tables: The look-up tables that the call has read, with buffers for their gradients. If the rows of the call are
             run in parts, all parts share this dict.
-        steps: The module's functions; None if the caller itself marks all rows with their axis.
+        steps: The module's recorded function calls; None if the caller itself marks all rows with their axis.
         quiet: Whether random numbers are 0.
 
     Attributes:
@@ -378,7 +379,7 @@ class GroupedRun(TorchFunctionMode):
         self.failed: Ungroupable | None = None
         self.widest = 1
         self._token = object()
-        self.counted = False  # whether an argument of the function is a SampleCount
+        self.counted = False  # whether the current function has a SampleCount
         self._steps = None if steps is None else iter(steps)
 
     # For rules --------------------------------------------------------------------------------------------------------
@@ -424,7 +425,7 @@ class GroupedRun(TorchFunctionMode):
     # Functions --------------------------------------------------------------------------------------------------------
 
     def _step(self, func: Any, args: Any, kwargs: Any) -> CallAxes | None:
-        """Returns the step of the next function, after a comparison with its name and its integers."""
+        """Returns the next recorded call, or None; raises :class:`Ungroupable` if function or integers differ."""
         if self._steps is None:
             return None
         step = next(self._steps, None)
@@ -525,7 +526,7 @@ class Grouped:
     On a CPU, ``forward`` runs on pieces of the rows, so that its tensors fit in the cache.
     """
 
-    records: list[list[CallAxes]]  # the known sequences of the module's functions, the latest last
+    records: list[list[CallAxes]]  # recorded sequences of function calls, the last used one last
     piece: int = 1 << 16  # maximum number of rows in a piece
     name: str = "grouped"
     why: str = ""
@@ -573,8 +574,8 @@ class Loop:
     """The loop: the module runs once for each cell that has samples. It defines the result of a routed call.
 
     ``again`` is for modules whose code runs again in the backward pass (``torch.utils.checkpoint``): every cell then
-    has its own double, which keeps the cell's parameters. Other loops replace the functions of ``EXACT`` if a call can
-    be differentiated by its arguments, and the first cell meets one; the mode that replaces them takes time.
+    has its own double, which keeps the cell's parameters. In other loops, if an argument requires gradients, the first
+    cell runs in the mode :class:`Exact`; the other cells do so only if the first one needs it, since it takes time.
     """
 
     why: str = ""

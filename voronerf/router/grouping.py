@@ -31,7 +31,7 @@ CHANGES = "_voronerf_changes"
 class Grouping:
     """n entries, each a sample in one of k cells, sorted by cell.
 
-    Tensors that are computed at their first use are never of inference mode, since later calls may use them.
+    Tensors that are computed at their first use are never inference tensors, since later calls may use them.
 
     Args:
         cells: The cell of each entry, int32 [n]; None for a single cell.

@@ -344,7 +344,7 @@ class Call:
 
 
 def recordable(tensor: Tensor) -> Tensor:
-    """Returns a tensor that autograd can save: outside of inference mode, a copy of an inference tensor."""
+    """Returns the tensor; outside of inference mode, the copy of an inference tensor, which autograd cannot save."""
     return tensor.clone() if tensor.is_inference() and not torch.is_inference_mode_enabled() else tensor
 
 

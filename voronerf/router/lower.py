@@ -291,11 +291,11 @@ class Entries:
 
 
 class Lowering:
-    """The steps of a trace, as one program; later they are divided into runs.
+    """The steps of a trace, as one program, which :class:`Fused` then divides into subprograms.
 
     Attributes:
         rows: The number of samples of the trace.
-        levels: For each value, the number of the run that computes it.
+        levels: For each value, the number of the subprogram that computes it.
         sources: For each input, the node of the trace whose rows it reads.
         columns: For each column number in codes, the value and the index of the column in this value.
         parameters: The source of each parameter of the program: a node or tensor, and the numbers of its entries.
@@ -337,7 +337,7 @@ class Lowering:
         return torch.equal(codes >> 32, torch.arange(self.rows, device="cpu")[:, None].expand_as(codes))
 
     def level(self, value: int) -> int:
-        """Returns the index of the run (a group of fused steps) that computes a value."""
+        """Returns the number of the subprogram that computes a value."""
         for step in self.builder.steps[self._leveled :]:
             self.levels.setdefault(
                 step.out, max((self.levels[c.index] for c in step.operands if c.of == VALUE), default=0)

@@ -1,7 +1,7 @@
 """Finds the fastest evaluation (fused or grouped) whose results agree with the loop over cells.
 
-Each of them runs once on a few samples of the first batch, in a copy of the module whose cells have different
-parameters. Results and gradients are compared.
+Each evaluation runs once on a few samples of the first batch, in a copy of the module whose cells have different
+parameters. Its results and gradients are compared with the loop's.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from voronerf.router.watch import Inputs, Source
 _OP = "VoronoiRouter"
 FEWEST = 8  # minimum number of samples in a probe; a smaller batch is extended by similar samples
 _SAMPLES, _CELLS = 41, 3  # numbers of samples and cells of a probe
-_COUNTS = (_SAMPLES, 37)  # numbers of samples by which sizes that count samples differ from other sizes
+_COUNTS = (_SAMPLES, 37)  # numbers of samples of two runs; sizes that change between them count samples
 _CHECKED = 8  # rows for the check whether a module needs a subclass of tensors
 _PIECE = 8 << 20  # bytes of the largest tensor in a piece of rows on a CPU; larger tensors outgrow the cache
 
@@ -60,7 +60,7 @@ class Options:
 
 
 class ProbeRuns(NamedTuple):
-    """Two runs of a module: their functions, the leaves of their results by name, and the double that ran."""
+    """Two runs of a module: the functions they call, the leaves of their results by name, and the double that ran."""
 
     runs: tuple[Recorder, Recorder]
     leaves: list[dict[str, Any]]
@@ -70,7 +70,7 @@ class ProbeRuns(NamedTuple):
 class Probe:
     """A copy of a module with three cells of different parameters, and a few samples of a call in these cells.
 
-    ``others`` are values of arguments, attributes and buffers that replace the current ones.
+    ``others`` are values of arguments, attributes and buffers that replace the current values.
     """
 
     def __init__(
@@ -171,11 +171,11 @@ class Probe:
         return loop, loop, may_group
 
     def steps(self) -> list[CallAxes]:
-        """Returns the steps of the module; see :class:`ProbeRuns`."""
+        """Returns the module's function calls, recorded in two runs (:class:`ProbeRuns`)."""
         return steps_of(self.record().runs, _COUNTS)
 
     def confirmed_steps(self) -> list[CallAxes]:
-        """Returns the steps of the module, with which it runs grouped like the loop; raises :class:`Ungroupable`."""
+        """Returns the module's calls if its grouped run equals the loop over cells; or raises :class:`Ungroupable`."""
         steps, loop = self.steps(), Loop()
         if not self._agrees(Grouped([steps], quiet=True), loop, self._outcome(loop)):
             raise Ungroupable("its forward gives other results than the loop over cells", of_batch=True)
@@ -215,9 +215,9 @@ class Probe:
         }
 
     def note_changes(self, warn_once: Callable[[str, str], None]) -> ProbeRuns:
-        """Records two runs of the module, and notes values that must not pass from one call to the next.
+        """Records two runs of the module; stores the names of the containers that they change (CHANGES).
 
-        These are the items of containers (CHANGES), numbers, and numbers of samples.
+        The items of these containers are restored after each call. Numbers are left to :meth:`_note_numbers`.
         """
         initial, call = self._containers(), self._source[0]
         if initial:
@@ -238,7 +238,7 @@ class Probe:
         return recording
 
     def _note_numbers(self, recording: ProbeRuns, warn_once: Callable[[str, str], None]) -> None:
-        """Finds the results that count samples; warns of other numbers, which a call cannot follow.
+        """Finds the results that count samples; warns of other numbers that change, in results or in attributes.
 
         Raises Forbidden for results whose width depends on the number of samples.
         """

@@ -180,7 +180,7 @@ class FieldProgram:
             program: CellProgram | str = f"{name} computes more than its program"
             ray_program, dependencies = None, unchanged()
             if _describes(field_type) and "forward" not in vars(field) and all(map(_is_plain, parts)):
-                with torch.inference_mode(False):  # turns gradients on, too: later calls use views of parameters
+                with torch.inference_mode(False):  # also enables gradients, for views in later calls
                     program = _checked(name, cast(Any, field).program())
                 ids = {id(p if p._base is None else p._base) for p in program.parameters}
                 if any(id(p) not in ids for p in cell_parameters(field)):

@@ -373,7 +373,7 @@ class VoronoiRouter(nn.Module):
 
     @torch.inference_mode(False)
     def unfreeze(self, cells: Sequence[int] | Tensor | None = None) -> None:
-        """Unfreezes cells, which keep the optimiser's moments from before. For ``cells`` see `freeze`."""
+        """Unfreezes cells; the optimiser's moments are as before the freeze. For ``cells`` see `freeze`."""
         self._set_frozen(self.frozen & ~self._mask("unfreeze", cells))
 
     def _mask(self, method: str, cells: Sequence[int] | Tensor | None) -> Tensor:
@@ -479,7 +479,7 @@ class VoronoiRouter(nn.Module):
         return parents
 
     def _watch_optimizers(self, line: str) -> None:
-        """Makes an optimiser with stale state raise at its next step; the error suggests the code ``line``."""
+        """Makes an optimiser with state of another number of cells raise at its next step; the error names ``line``."""
         for watch in self._watches:
             watch.remove()
         self._watches = watch_optimizers(self.module, line)
@@ -661,7 +661,7 @@ class VoronoiRouter(nn.Module):
         )
 
     def note_dependencies(self, noted: Any) -> tuple[Any, ...]:
-        """Notes attributes for a recorded training step, which is recorded again when they change."""
+        """Adds attributes to the dependencies of a recorded training step, which is recorded again if one changes."""
         noted.entries(vars(self), ["assignment", "temperature", "backend", "coords"])
         return ()
 

@@ -100,7 +100,7 @@ _PAIR = re.compile(r"(\w+),(\w+)->(\w+)")
 
 @rule(torch.einsum)
 def einsum(run: GroupedRun, equation: str, *operands: Any) -> Any:
-    """Multiplies rows by a parameter, such as ``"bid,iod->bo"``, ``"bhi,hio->bho"`` or ``"bi,oi->bio"``."""
+    """Multiplies rows by a parameter, by equations like ``"bid,iod->bo"``, ``"bhi,hio->bho"`` or ``"bi,oi->bio"``."""
     operands = tuple(operands[0]) if isinstance(operands[0], (list, tuple)) else operands
     match = _PAIR.fullmatch(equation.replace(" ", ""))
     if match is None or len(operands) != 2:
@@ -229,9 +229,9 @@ def convolution(
 
 
 def _spread(run: GroupedRun, parameter: PerCell, after: int, m: int) -> Tensor | None:
-    """Repeats a parameter for each row, with the rows before its last ``after`` dimensions; returns None if it varies.
+    """Repeats a parameter for each row; the dimension of the rows precedes the last ``after`` dimensions.
 
-    A parameter with a dimension of another size than 1 at the place of the rows differs between samples.
+    Returns None if the parameter already has a size other than 1 there, because it then differs between samples.
     """
     shape, stacked = parameter.shape, parameter.stacked
     before = max(len(shape) - after - 1, 0)
@@ -413,7 +413,7 @@ _CELLS: dict[str, Callable[..., tuple[Tensor, ...]]] = {
     "rnn_tanh": lambda x, h, state: (torch.tanh(x + h),),
     "rnn_relu": lambda x, h, state: (torch.relu(x + h),),
 }
-"""The next state of a recurrent cell, from the products of its input and of its state, and from the state."""
+"""By name, the function from x W_ih, h W_hh and the state of a recurrent cell to its next state."""
 
 
 def _recurrent_cell(
@@ -520,7 +520,7 @@ class _Source(torch.autograd.Function):
 
 
 class _LookUp(torch.autograd.Function):
-    """An autograd function that looks up rows of a table, a :class:`_Source`; index 0 is its row ``first``."""
+    """A look-up of rows in a table (a result of :class:`_Source`); indices count from the table's row ``first``."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, first: int, index: Tensor, buffer: list[Tensor]) -> Tensor:

@@ -42,7 +42,7 @@ from voronerf.router.watch import Inputs, lookup
 
 CONSTANTS, CELLS, SAMPLES = range(3)  # dependence of a value: the maximum over its operands
 _ROWS = (37, 41, 31, 29)  # numbers of samples of a trace, see `rows_for`
-_TOTALS = find("any all sum", torch, torch.Tensor)  # their scalar results may be used for a gradient only
+_TOTALS = find("any all sum", torch, torch.Tensor)  # scalar results are allowed as inputs of autograd.grad only
 
 
 def differentiable(value: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ def rows_for(module: nn.Module, tensors: list[Tensor]) -> int:
 
 
 def _remedy(usual: str) -> str:
-    """Returns the remedy that an error names: ``usual``, or another one while a distribution checks its arguments."""
+    """Returns the remedy for an error: ``usual``, or another one while torch.distributions checks arguments."""
     frame = inspect.currentframe()
     while frame is not None and frame.f_globals.get("__name__") != "torch.distributions.distribution":
         frame = frame.f_back
@@ -98,7 +98,7 @@ class Trace(TorchFunctionMode):
 
     ``tensors`` are rows of the arguments, at least 41; ``inputs`` are the values that each call looks up, and ``reads``
     are the attributes that were read. Two runs with different numbers of samples precede the trace (:class:`Recorder`).
-    Raises :class:`Unfusable` for a step that cannot be repeated for other samples.
+    Raises :class:`Unfusable` for a function that cannot be repeated for other samples.
     """
 
     def __init__(self, call: Call, tensors: list[Tensor], inputs: Inputs) -> None:
@@ -240,7 +240,7 @@ class Trace(TorchFunctionMode):
     def _begin(self, func: Any, args: Any, kwargs: Any, step: CallAxes | None = None) -> _Begun:
         """Records a function before its call; returns the node with the function and arguments to call.
 
-        A custom function of autograd has no step.
+        ``step`` is the recorded call; None for a custom function of autograd.
         """
         frame = user_frame()
         self._line = line = line_of(frame)
@@ -256,7 +256,7 @@ class Trace(TorchFunctionMode):
         if step and step.counts:
             args, kwargs = with_counts((args, kwargs), iter(step.counts))
         func, args = converted(func, args)
-        if func is torch.autograd.grad:  # all cells have one graph; in a loop, each has its own
+        if func is torch.autograd.grad:  # all cells share one graph, while a loop makes one each
             kwargs = {**kwargs, "retain_graph": True}
         node = self.graph.call_function(func, *map_aggregate((args, kwargs), self._argument))
         node.meta["inplace"] = writes_in_place(func) or bool(kwargs.get("inplace"))
@@ -297,7 +297,7 @@ class Trace(TorchFunctionMode):
     def _separate_gradients(self) -> None:
         """Inserts a `differentiable` node after each tensor by which ``torch.autograd.grad`` differentiates.
 
-        PyTorch computes this node between runs. All functions that used the tensor use the node instead.
+        PyTorch computes this node between subprograms. All functions that used the tensor use the node instead.
         """
         for node in list(self.graph.nodes):
             if node.target is not torch.autograd.grad:

@@ -27,9 +27,9 @@ float64 does not round numbers; float32 promotes other dtypes in the same way as
 """
 
 HOOKS = ("_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks")
-_DICTIONARIES = frozenset({"_modules", *HOOKS})  # of every module; only their contents change
+_DICTIONARIES = frozenset({"_modules", *HOOKS})  # dictionaries of every module, of which only the contents change
 _UNWATCHED = frozenset(vars(nn.Module())) - {"training", *_DICTIONARIES}
-_OF_CLASSES = (bool, int, float, str, FunctionType)  # a value of the module itself would override them
+_OF_CLASSES = (bool, int, float, str, FunctionType)  # types of class attributes that a module's attribute may override
 _MISSING: Any = object()
 
 
@@ -83,7 +83,7 @@ class _Seen(NamedTuple):
         return not is_same or any(tensor.changed() for tensor in self.tensors)
 
     def note(self, dependencies: Any) -> None:
-        """Adds the value to dependencies (`voronerf.ops._core.unchanged`)."""
+        """Adds the value to ``dependencies`` (`voronerf.ops._core.unchanged`)."""
         if self.source[1] not in _DICTIONARIES:
             dependencies.entries(self.registry, [self.source[1]])
         for tensor in self.tensors:
@@ -117,11 +117,11 @@ class Watch:
             self._seen.append(_Seen((place, name), registry, value, container, items, tensors))
 
     def value(self, source: Source) -> Any:
-        """Returns the value that a trace took as a constant; None if there is none."""
+        """Returns the value that the trace read from a source; None if it did not read the source."""
         return next((seen.value for seen in self._seen if seen.source == source), None)
 
     def note(self, dependencies: Any) -> Any:
-        """Adds the values to dependencies, and returns these."""
+        """Adds the watched values to ``dependencies``, and returns it."""
         for seen in self._seen:
             seen.note(dependencies)
         return dependencies

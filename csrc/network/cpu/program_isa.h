@@ -40,7 +40,7 @@ VN_DECLARE_FOR_ISA(void program_pack(const CpuProgram& call, int64_t cell, bool 
 VN_DECLARE_FOR_ISA(void program_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end,
                                     const float* packed, float* tiles, float* partial))
 
-// The same functions with products of bfloat16 pairs.
+// program_pack and program_run with products of bfloat16 pairs.
 #if VN_HAS_HALF
 namespace avx512 {
 void program_half_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free);
@@ -49,7 +49,7 @@ void program_half_run(const CpuProgram& call, int64_t cell, int64_t begin, int64
 }  // namespace avx512
 #endif
 
-// The same functions with tile registers, which the portable path emulates.
+// program_pack and program_run with tile registers, which the portable path emulates.
 #define VN_DECLARE_TILES                                                                                        \
   void program_tiles_pack(const CpuProgram& call, int64_t cell, bool first, float* packed, float* free);        \
   void program_tiles_run(const CpuProgram& call, int64_t cell, int64_t begin, int64_t end, const float* packed, \

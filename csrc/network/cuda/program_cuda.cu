@@ -211,7 +211,7 @@ __device__ __forceinline__ bool own_steps(const CudaProgram& call, const Tile& t
     }
   }
 }
-// The same for a warp without rows, which runs no steps.
+// Sets i to the index of the next sum, for a warp without rows, which runs no steps. Returns false if the program ends.
 __device__ __forceinline__ bool next_sum(const CudaProgram& call, int& i) {
   for (;; ++i) {
     const CudaStep step = load_step(call.steps + i);
@@ -405,7 +405,7 @@ __device__ void clear_strays(const CudaProgram& call) {
   }
 }
 
-// Prepares a call. The first block also numbers the tasks.
+// Prepares a call: packs the weights, and sets outputs of rows in no cell to 0. The first block also numbers the tasks.
 __global__ void __launch_bounds__(kThreads)
     program_prepare_kernel(const VN_GRID_CONSTANT CudaProgram call, int64_t most, ProgramPrecision precision) {
   if (blockIdx.x == 0) number_tasks(call.rows, call.task_rows, most);

@@ -411,7 +411,7 @@ __device__ __forceinline__ void input_step(const Tile& tile, const CudaStep& ste
     if (to.has_floats) for_few(width, [&](int i) { floats[i] = values[i]; });
   }
   if (!to.has_halves || row >= Tile::kRows) return;
-  // The whole padded row, and rows without a sample, which are 0.
+  // Stores the whole padded row; rows without a sample are 0.
   static_assert(kFewColumns == 8, "one store of 16 bytes");
   auto* const words = reinterpret_cast<uint4*>(to.halves + row * to.halves_stride);
   const auto word = [&](int i) { return pack_halves<Tile::kBfloat16>(values[i], values[i + 1]); };

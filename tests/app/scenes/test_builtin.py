@@ -73,7 +73,7 @@ def test_hits_against_marching(solid):
     for origin, direction, distance in zip(origins, directions, depths):
         within = inside(solid, origin + steps[:, None] * direction)
         hits += within.any()
-        # A ray may graze a solid for less than a step.
+        # A ray without a hit may graze the solid at a few of the tested points.
         assert np.isfinite(distance) or within.sum() < 20
         if within.any() and np.isfinite(distance):
             first = steps[within][0]

@@ -143,7 +143,7 @@ def test_a_mask_lies_as_its_image_is_stored_or_as_it_is_seen(tmp_path, tag, upri
 @pytest.mark.parametrize("format", ["transforms", "colmap", "llff"])
 @pytest.mark.parametrize("tag", [1, 6])
 def test_masks_of_instant_ngp_leave_out_what_is_not_black(tmp_path, format, tag):
-    """The masks lie beside the images in every format, as stored or as seen, and are no images themselves."""
+    """Masks beside the images, upright or as stored, are found in every format, and are not read as images."""
     exif, turns = Image.Exif(), {1: 0, 6: 3}[tag]
     exif[0x0112] = tag
     write_images(tmp_path, [SIZE] * COUNT, exif=exif)

@@ -425,7 +425,7 @@ def test_images_of_transforms_are_found_where_they_are(tmp_path, name, file):
 
 @pytest.mark.parametrize("start", ["/home/me/scan/", "E:\\scan\\"])
 def test_images_of_two_cameras_on_another_machine(tmp_path, start):
-    """Images with equal base names are told apart by their folders; a missing image is not taken from the other one."""
+    """Images with equal base names are told apart by their folders; none is taken from the other camera's folder."""
     names = [f"{'left' if index % 2 else 'right'}/{index // 2:02d}.png" for index in range(9)]
     write_listed(tmp_path, [start + name.replace("/", "\\" if "E" in start else "/") for name in names], names)
     check_listed(tmp_path, 9)
@@ -459,7 +459,7 @@ def test_a_path_of_this_machine_that_leads_outside_is_read_only_inside(tmp_path)
 
 
 def test_pictures_of_runs_and_depths_are_not_photographs(tmp_path):
-    """A run of the scene has the scene's name, and panels with the names of its test images in `images`."""
+    """Panels of a run in the scene's folder, normals and depths have the photographs' names, but are no photographs."""
     folder = tmp_path / "scan"
     names = [f"/home/me/scan/images/{index:02d}.jpg" for index in range(9)]
     write_listed(folder, names, [f"rgb/{index:02d}.jpg" for index in range(9)])
@@ -568,8 +568,10 @@ def test_times_that_differ_are_said(tmp_path, times, said):
 )
 @pytest.mark.parametrize("scale", [1, 2])
 def test_cameras_of_upright_pictures(tmp_path, tag, model, lens, scale):
-    """Cameras of the pictures as an orientation tag turns them give the same rays as the upright pictures without a
-    tag, which the model may have seen larger."""
+    """Pictures stored turned, with an orientation tag, have the same rays as upright pictures without a tag.
+
+    COLMAP's cameras are of the upright pictures, which may have been larger.
+    """
     exif, generator = Image.Exif(), np.random.default_rng(1)
     exif[0x0112] = tag
     turns = {6: -1, 8: 1}[tag]
@@ -596,7 +598,7 @@ def test_cameras_of_upright_pictures(tmp_path, tag, model, lens, scale):
             torch.testing.assert_close(rays[0].directions, rays[1].directions, atol=2e-6, rtol=0)
             torch.testing.assert_close(rays[0].origins, rays[1].origins, atol=1e-6, rtol=0)
     assert torch.equal(plain.train.sparse_depth.pixels, tagged.train.sparse_depth.pixels)
-    other = tmp_path / "tagged/images/04.jpg"  # upside down: the other cameras tell that its camera is upright, too
+    other = tmp_path / "tagged/images/04.jpg"  # upside down: its camera counts as upright because the others are
     upright = np.asarray(Image.open(tmp_path / "plain/images/04.png"))
     exif[0x0112] = 3
     Image.fromarray(np.rot90(upright, 2)).save(other, exif=exif, quality=100, subsampling=0)
@@ -610,7 +612,7 @@ def test_cameras_of_upright_pictures(tmp_path, tag, model, lens, scale):
     full = plain.train.cameras
     assert (tagged.width, tagged.height) == (3, 4)
     x, y = torch.tensor([0.5, 2.5]), torch.tensor([0.5, 3.5])
-    left, top = (1, 0) if tag == 6 else (0, 1)  # the dropped row or column of the stored picture lies there
+    left, top = (1, 0) if tag == 6 else (0, 1)  # the side of the dropped row or column
     down = full.rays(0, 3 * x + left, 3 * y + top)
     torch.testing.assert_close(tagged.rays(0, x, y).directions, down.directions, atol=1e-5, rtol=0)
 

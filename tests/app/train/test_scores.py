@@ -60,7 +60,7 @@ def scored(monkeypatch, view_seconds, **settings):
 
 @pytest.mark.parametrize("seconds", [0.001, 0.1, 0.3, 1.0, 3.0, 20.0])
 def test_evaluations_take_a_tenth_of_the_budget(monkeypatch, seconds):
-    """Slow views lead to fewer views, to one evaluation at the end, or to only the middle of one view."""
+    """If views are slow, fewer views are scored, or views only at the end, or only the middle of one view."""
     state, scores, clock = scored(monkeypatch, lambda now: seconds)
     spent = clock.now - state.seconds
     views = [line["views"] for line in scores.metrics]

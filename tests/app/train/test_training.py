@@ -188,8 +188,8 @@ def test_parameters_decide_the_width(scene, field):
 def test_octaves_follow_the_pixels(scene):
     """A 100 x 100 image needs 8 octaves, and halving the pixel size adds one: 10 at 400 x 400, as in the paper.
 
-    The integrated encoding of cones needs two octaves more. In the middle of the scene the last of them still has a
-    visible amplitude; one more octave would have none.
+    The integrated encoding of cones needs two octaves more. In the middle of the scene, its last octave still has a
+    visible amplitude, and one more octave would have none.
     """
     some = scene.train.cameras
     for size, octaves in ((50, 7), (100, 8), (200, 9), (400, 10)):
@@ -295,13 +295,13 @@ def test_floaters_are_dropped_at_the_end_of_a_long_training_with_many_views(monk
 
 
 def test_long_trainings_in_contracted_space_have_a_lower_rate_and_more_rays(scene):
-    """Twice `LONG_STEPS` halve the rate, but not the weight decay; with a budget, there are four times as many rays."""
+    """Twice `LONG_STEPS` steps halve the rate, but not the decay; with a budget, a step has four times as many rays."""
 
     def at_half(**options):
         table = ("levels=2", "log2_entries=10")
         state = build(TrainConfig(width=8, cells=(), rays=64, field_options=table, **options), scene)
         state.step, state.seconds = 3904, 50.0
-        output = SimpleNamespace(loss=0.0, samples=10**9)  # so many that `next_rays` takes no more rays than needed
+        output = SimpleNamespace(loss=0.0, samples=10**9)  # so many samples that `next_rays` adds no rays
         prepare(state)
         state.read_output(output)
         (rate, _), decay = (group["lr"] for group in state.optimizer.param_groups), state.optimizer.decay

@@ -51,7 +51,7 @@ def _prepare() -> None:
 
 
 def keep_freed_memory() -> None:
-    """Makes the C library keep freed memory, so that the next step does not fault the same pages in again."""
+    """Makes the C library keep freed memory, so that later steps do not page-fault the same memory again."""
     with contextlib.suppress(AttributeError, TypeError):  # a C library without these limits
         limit = ctypes.CDLL(None).mallopt
         limit(-3, 1 << 25)  # glibc's M_MMAP_THRESHOLD, at its maximum

@@ -65,7 +65,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
 
 
 def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns the figures and the settings of a run, among them the options of its field.
+    """Returns the figures of a run, and its settings with the options of its field.
 
     Raises:
         ConfigError: There is no run, or one of its folders is a link to elsewhere.
@@ -96,7 +96,7 @@ def count_parts(run: Path) -> dict[str, Any]:
 
 
 def shown(value: object, places: int | None) -> str:
-    """Formats a number, or a time in seconds without ``places``, for the table; anything else becomes a dash."""
+    """Formats a number with ``places`` decimals, or seconds as a time if ``places`` is None; other values as a dash."""
     if not isinstance(value, int | float):
         return "-"
     if places is not None:

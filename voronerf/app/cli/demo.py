@@ -95,7 +95,7 @@ def show(run: Path, scene: Scene, scores: dict[str, Any], budget: float) -> None
 
 
 def turn(count: int, *, height: float = 0.0, distance: float = 1.0) -> Cameras:
-    """Returns a turntable around the scene, ``height`` higher and ``distance`` times as far away as usual."""
+    """Returns an orbit around the built-in scene, raised by ``height``, with ``distance`` times the default radius."""
     return orbit_cameras(
         count,
         radius=3.9 * distance,

@@ -95,7 +95,7 @@ def find_cameras(sources: Sequence[Path], out: Path, settings: ProcessSettings) 
 
 @contextlib.contextmanager
 def prefixed_options(settings: ProcessSettings) -> Iterator[Callable[[str], str]]:
-    """A context in which errors name the options as the command does; yields a function that renames them in a text."""
+    """A context in which errors name options with the command's prefix; yields a function that adds it in a text."""
     names = "|".join(field.name.replace("_", "-") for field in fields(settings))
 
     def renamed(text: str) -> str:
@@ -128,7 +128,7 @@ class TimeLeft(ProgressColumn):
 
 
 class StageDisplay:
-    """A display of the stages of a long command: a line with the remaining time on a terminal, a line each elsewhere.
+    """A display of the stages of a long command: on a terminal a line with the remaining time, else a line per stage.
 
     Its ``progress`` is the context manager that shows the line.
     """

@@ -23,7 +23,7 @@ OPENING, CLOSING = "\u201c\u201d\u201e\u2018\u2019\u201a\u00ab\u00bb", "\u201c\u
 
 
 def check_characters(name: str, command: Callable[..., int], words: list[str]) -> None:
-    """Raises ConfigError for a dash or quote that is not of a keyboard, and for a ~ that the shell has not expanded.
+    """Raises ConfigError for a typographic dash or quote, and for a ~ that the shell has not expanded.
 
     The message shows the command line as it should be typed. Paths that exist may have such characters.
     """
@@ -53,7 +53,7 @@ def check_characters(name: str, command: Callable[..., int], words: list[str]) -
 
 
 def _joined_quotes(words: list[str]) -> list[str]:
-    """Returns the words, after joining the words of a text in quotes that a shell has split at its spaces."""
+    """Returns the words; a text in typographic quotes, which the shell has split at its spaces, becomes one word."""
     result: list[str] = []
     for number, word in enumerate(words):
         is_open = result and re.match(f"(--[^=]*=)?[{OPENING}]", result[-1]) and not is_quoted(result[-1])

@@ -111,8 +111,8 @@ def train(
             --budget, as many as fit into a tenth of it, at least one.
         tensorboard: Also write loss, speed, cells and scores for TensorBoard, into the folder tensorboard of the run.
         view: Show the training in a browser, and its result until Ctrl-C.
-        host: Address that --view listens at; the default is for this machine only, 0.0.0.0 lets others in.
-        port: Port that --view listens at; 0 is any free port.
+        host: Address that --view listens on; the default is for this machine only, 0.0.0.0 lets others in.
+        port: Port that --view listens on; 0 is any free port.
         explain: Only print how a training step is computed, and what prevents a faster implementation.
         capture: The settings of COLMAP.
     """
@@ -189,7 +189,7 @@ def train(
 
 
 def follow(config: TrainConfig, ranks: Ranks) -> int:
-    """Trains as one of several processes, but not the first, which alone prints, evaluates and writes files.
+    """Trains as any process but the first, which alone prints, evaluates and writes files.
 
     Returns:
         The exit status.
@@ -212,7 +212,7 @@ def follow(config: TrainConfig, ranks: Ranks) -> int:
 def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainConfig, int]:
     """Makes a scene of a video or a folder of pictures, in the folder `CAPTURE` of a run.
 
-    Without --out, the run is one that has begun with the same data and settings, or else a new one.
+    Without --out, the run is one that has the same data and settings and was stopped before its training, or a new one.
 
     Returns:
         (the settings with this scene and run, 0 or the exit status after a stop).
@@ -238,7 +238,7 @@ def with_cameras(config: TrainConfig, settings: CaptureSettings) -> tuple[TrainC
 
 
 def _begun(name: str, settings: Settings) -> Path | None:
-    """Returns the last run of this name that was stopped, with these settings, before its training; or None."""
+    """Returns the last run of this name that has these settings and was stopped before its training, or None."""
     for record in sorted(Path("runs").glob(f"{glob.escape(name)}*/{CAPTURE}/colmap/{RECORD}"), reverse=True):
         run = record.parents[2]
         with contextlib.suppress(ValueError, OSError, ConfigError):  # damaged, or in use by another process
@@ -308,8 +308,8 @@ def run_training(
 ) -> dict[str, Any]:
     """Trains into ``config.out`` with a display, then draws panels and the curve; returns the summary.
 
-    ``watch`` makes the callback that shows the training in a viewer. ``quiet`` prints only the live line. With
-    several processes, this is the first; see `follow` for the others.
+    ``watch`` makes the callback that shows the training in a viewer. ``quiet`` prints only the live line. Of
+    several processes, the first calls this function; the others call `follow`.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 end training after the current step: the checkpoint and the summary are written,
     the pictures are not. A second signal ends the process at once.

@@ -16,8 +16,8 @@ def view(run: Path, /, host: str = "127.0.0.1", port: int = 8080, opening: Openi
 
     Args:
         run: The run directory.
-        host: Address to listen at; the default is for this machine only, 0.0.0.0 lets others in.
-        port: Port to listen at; 0 is any free port.
+        host: Address to listen on; the default is for this machine only, 0.0.0.0 lets others in.
+        port: Port to listen on; 0 is any free port.
         opening: The settings with which the run is opened.
     """
     viewers = import_viewer()

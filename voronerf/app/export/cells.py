@@ -1,8 +1,8 @@
 """Exports the cells of a diagram as coloured polyhedra.
 
-A point is in a cell if, on each level of the diagram, the cell's centre is nearer than the centres of all siblings.
-Each such condition is a half-space, `2 (b - a) . x <= |b|^2 - |a|^2` for a centre a and its sibling b. The box adds six
-half-spaces. Their intersection is a convex polyhedron.
+A point is in a cell if, on each level of the diagram, the centre of the cell or of its ancestor is nearer than the
+centres of all its siblings. Each such condition is a half-space, `2 (b - a) . x <= |b|^2 - |a|^2` for a centre a and
+its sibling b. The box adds six half-spaces. Their intersection is a convex polyhedron.
 """
 
 from __future__ import annotations

@@ -118,8 +118,8 @@ def export_mesh(
 def looked_at(views: list[SurfaceView]) -> Tensor | None:
     """Returns the box [2, 3] of the region that the cameras look at, or None if there is none.
 
-    The box encloses the surface points that project into the pictures of at least half of the views, and whose distance
-    to the cameras' focus is below the median distance of the cameras. Outliers are left out.
+    The box encloses the surface points that project into the pictures of at least half of the views. If the cameras
+    share a focus, the points must also be nearer to it than the median camera. Outliers are left out.
     """
     cameras = Cameras.joined([view.camera for view in views])
     points = torch.cat([view.surface.reshape(-1, 3) for view in views])

@@ -136,9 +136,9 @@ def lists_cameras(file: Path | str) -> bool:
 def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
     """Reads the cameras of a transforms file, such as transforms.json, as cameras in a scene; images need not exist.
 
-    The cameras are in the order of the file. Poses are in the coordinates of the scene's files, before
-    these were moved, turned and scaled. Lenses keep their distortion. All cameras get the commonest size,
-    see :func:`resized`; a camera of unknown size, as in Blender's files, has the commonest size of the training images.
+    The cameras are in the order of the file. The file's poses are in the coordinates of the scene's files, the returned
+    poses in the scene's. Lenses keep their distortion. All cameras get the commonest size, see :func:`resized`; a
+    camera of unknown size, as in Blender's files, has the commonest size of the training images.
 
     Args:
         file: the file, with a list `frames` of which each entry has a `transform_matrix`.
@@ -271,13 +271,13 @@ def smooth_path(keyframes: Cameras, count: int, *, closed: bool = False) -> Came
 
 
 def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Cameras:
-    """Returns a path that stays near the cameras of a capture, so that it shows regions that they have seen.
+    """Returns a path that stays near the cameras of a capture, so that its frames show regions in the captured images.
 
-    For forward-facing cameras, the path is the spiral of LLFF (Mildenhall et al. 2019) around their focus, as large
-    as their extent. For cameras around a focus, it is a turn around the focus, at the mean distance and height of the
-    nearest cameras; if the cameras leave a gap, the path goes from one end of the gap to the other and back, without
-    crossing the gap. For cameras that look outwards, it is a smooth path through some of them, in their order. The
-    frames have the commonest size of the cameras.
+    For forward-facing cameras, the path is the spiral of LLFF (Mildenhall et al. 2019) around the cameras' focus, as
+    large as the cameras' extent. For cameras around a focus, it is a turn around the focus, at the mean distance and
+    height of the nearest cameras; if the cameras leave a gap, the path goes from one end of the gap to the other and
+    back, without crossing the gap. For cameras that look outwards, it is a smooth path through some of the cameras, in
+    their order. The frames have the commonest size of the cameras.
 
     Args:
         cameras: the cameras of the capture, such as the training views; the path has their mean focal length.
@@ -328,7 +328,7 @@ def like_most(cameras: Cameras) -> Cameras:
 
 
 def resized(cameras: Cameras, size: tuple[int, int]) -> Cameras:
-    """Resizes cameras to another (width, height); the new pictures show nothing beyond the old ones on any side."""
+    """Resizes cameras to another (width, height); if the aspect ratio differs, the pictures are cropped, not padded."""
     scale = max(size[0] / cameras.width, size[1] / cameras.height)
     intrinsics = scale * cameras.intrinsics
     intrinsics[:, 2] += (size[0] - scale * cameras.width) / 2

@@ -32,7 +32,7 @@ BUILTIN, CITY = "builtin", "builtin-city"  # optional suffix: builtin:SIZE, buil
 CACHED = 100  # least side, in pixels, of a built-in scene that is cached
 MOST_PIXELS = 1600  # largest side of the built-in scene
 
-#: Suffixes of files that are no scenes, and words about them; {} is the file.
+#: Suffixes of files that are not scenes, and the ends of error messages about them, in which {} is the file.
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar")
 SHAPES = (".ply", ".splat", ".spz", ".sog", ".pcd", ".las", ".laz", ".e57", ".obj", ".glb", ".gltf", ".fbx", ".stl")
 REMEDIES = {
@@ -88,7 +88,7 @@ def _formats_of(folder: Path) -> list[str]:
 def needs_cameras(source: str | Path) -> bool:
     """Returns whether a source is a video, or a folder of pictures or videos without cameras, for `voronerf process`.
 
-    The pictures may lie in subfolders, unless one of these is a scene or a run.
+    The pictures may lie in subfolders, unless a subfolder is a scene or a run.
     """
     path = Path(source)
     if path.is_file():
@@ -135,9 +135,9 @@ def load_scene(
         images: the storage of a folder's images: "memory"; "disk", a file of the cache (VORONERF_CACHE, or `voronerf`
             in the user's caches) that is mapped into memory; or "auto", which is "disk" if the images do not fit into
             memory.
-        keep_far: keep photographs whose cameras lie far from the others. By default they are left out, since one such
-            camera would determine the scale of the scene.
-        region: x y z of the lowest and of the highest corner of a box. Only pixels whose rays meet it are used, and the
+        keep_far: keep photographs whose cameras lie far from all other cameras. By default these photographs are left
+            out, since one such camera would determine the scale of the scene.
+        region: x y z of the lowest and of the highest corner. Only pixels whose rays meet the box are used; the
             rest of the scene becomes a background. None is the whole scene.
 
     Raises:

@@ -32,9 +32,10 @@ OUTSIDE = 1e-3  # largest fraction of the masks' pixels whose rays may miss the 
 def carve_box(cameras: Cameras, alpha: Tensor, near: float, far: float) -> Tensor | None:
     """Returns the bounding box of the voxels that at most one mask excludes.
 
-    A voxel is removed if two views see it entirely outside their masks. Each mask is dilated by the voxel's size in
-    pixels, so that the box does not cut the object. The box is larger than the object by one or two voxels, each about
-    a fortieth of the object's size, and includes concavities that no silhouette shows.
+    A voxel is removed if two views see it entirely outside their masks, or if fewer than a quarter of the views see it.
+    Each mask is dilated by the voxel's size in pixels, so that the box does not cut the object. The box is larger than
+    the object by one or two voxels, each about a fortieth of the object's size, and includes concavities that no
+    silhouette shows.
 
     Args:
         cameras: c perspective cameras around the object, which look at it.

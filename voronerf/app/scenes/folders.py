@@ -43,7 +43,7 @@ class ImageFolder(NamedTuple):
         full: the folder of the same images in full size; None if ``path`` holds images in full size, or if there is no
             such folder.
         masks: the folder of the images' masks, or None.
-        factor: the factor by which the images in ``path`` must still be downscaled; None to choose it by their size.
+        factor: the factor by which the images in ``path`` must still be downscaled; None to choose the factor by size.
         notes: lines for the user.
         root: the folder that must hold all files.
     """
@@ -103,12 +103,12 @@ def choose_images(folder: Path, downscale: int | None, images: str = "images") -
 def other_folder(
     source: Path, folder: Path, images: str, names: Sequence[str], allow_outside: bool
 ) -> tuple[str, tuple[str, ...]]:
-    """Finds the folder of a model's images, if it is not called ``images``, a path in the scene's folder.
+    """Finds the folder of a model's images if the path ``images`` does not exist in the scene's folder.
 
-    Other folders are the scene's folder and its subfolders, except for folders of masks and depths.
+    The search covers the scene's folder and its subfolders, except for folders of masks and depths.
 
     Returns:
-        (the path of the other folder with most files that the model names, or ``images`` if ``images`` exists or if
+        (the path of the folder with most files that the model names, or ``images`` if ``images`` exists or if
         there is no such folder; lines for the user).
     """
     if image_folders(folder, images):
@@ -210,18 +210,18 @@ def find_files(
     accepts: Accepts = has_images,
     but: Sequence[Path] = (),
 ) -> dict[str, Path]:
-    """Finds the image files in a folder and its subfolders of the names that have no file in ``exact``.
+    """Finds the image file of each name: its file in ``exact``, or a file in a folder and its subfolders.
 
     A name is compared with a file's path: exactly, then with the suffix of the path removed, then with the suffixes of
-    the name and the path removed, where Unicode has several spellings for a name. Names without a file are compared by
-    the same three rules again, ignoring case. If none of the names has a file, they are compared by `compare_tails`.
+    the name and the path removed, each in normalised Unicode. Names without a file are compared by the same three rules
+    again, ignoring case. If none of the names has a file, they are compared by `compare_tails`.
 
     Args:
         source: the file that lists the names, for error messages.
         folder: the folder of the files.
         names: normalised names, see `plain`.
         exact: the file of each name whose file exists as it is named.
-        of_one_folder: whether the folder of a name must be the file's, at least in its innermost part.
+        of_one_folder: whether the innermost folders of a name and of its file must be equal.
         accepts: see `compare_tails`.
         but: files that are not taken.
 

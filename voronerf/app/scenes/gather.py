@@ -38,8 +38,8 @@ from voronerf.app.scenes.soundness import some_of
 #: Container formats of videos. Playlists are excluded, since they name other files.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg"
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".ts", ".mpg", ".3gp")
-#: The transfer functions of HDR video, by ffmpeg's names. In a frame of a video that states none, a ninth decile of the
-#: brightness above `BRIGHT` speaks for HLG, whose white is at 75 %; the white of PQ is at 58 % (ITU-R BT.2408).
+#: The transfer functions of HDR video, by ffmpeg's names. If a video in BT.2020 states none, it is HLG if the
+#: ninth decile of its brightness is above `BRIGHT`, between the whites of PQ (58 %) and HLG (75 %, ITU-R BT.2408).
 HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 BRIGHT = 0.63
 #: The filters from HDR to sRGB: white is at 203 cd/m2 (BT.2408); up to 0.8 of it, colours are kept.
@@ -125,7 +125,7 @@ def emptied(folder: Path) -> Path:
 
 
 def files_of(folder: Path) -> Iterator[Path]:
-    """Yields the files of a folder and its subfolders, or the file itself.
+    """Yields the files of a folder and its subfolders; for the path of a file, that file.
 
     It skips hidden files, system files, masks, folders of masks, depths and smaller copies, and scenes made by
     :func:`process`. Of Polycam's raw folders, it takes only the images without distortion.
@@ -363,7 +363,7 @@ def _run_ffmpeg(video: Path, options: Sequence[str]) -> subprocess.CompletedProc
 
 
 def _reason(errors: str) -> str:
-    """Returns the first line of ffmpeg's errors, the cause of the others, without the name of a part of ffmpeg."""
+    """Returns the first line of ffmpeg's errors, which causes the later ones, without its prefix ``[component]``."""
     return re.sub(r"^\[.*?\] ", "", (errors.strip().splitlines() or ["no reason"])[0])[:200]
 
 

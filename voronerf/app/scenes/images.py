@@ -38,7 +38,7 @@ TURNS = {3: 2, 6: 3, 8: 1}
 ROUNDED = 2
 #: If alpha is used as a mask, pixels with an alpha below this are masked, since their colour is partly background.
 OPAQUE = 250
-#: The beginning of the names of instant-ngp's masks, whose pixels that are not black are left out. The mask of 0.jpg is
+#: The beginning of the names of instant-ngp's masks, in which only black pixels are kept. The mask of 0.jpg is
 #: dynamic_mask_0.png beside it.
 DYNAMIC_MASK = "dynamic_mask_"
 #: The largest fraction of the free memory for a scene; the rest is for the networks.
@@ -198,7 +198,7 @@ def read_images(
         paths: at least one file.
         headers: the headers, with None for each header that has not been read yet.
         factor: downscale factor, >= 1.
-        keep: "memory"; "disk", see `voronerf.app.scenes.store`; or "auto": on disk if they do not fit into memory.
+        keep: "memory"; "disk", see `voronerf.app.scenes.store`; or "auto": on disk if memory is short.
         name: the name of the scene.
         most_channels: the maximum number of channels; 3 drops alpha.
         upright: turn images upright by their orientation tags.
@@ -262,11 +262,11 @@ def read_masks(
     name: str = "images",
     alpha: bool = False,
 ) -> Tensor | None:
-    """Decodes the masks of images; a pixel of a reduced mask is True if no pixel of its block is left out.
+    """Decodes the masks of images; a pixel of a reduced mask is True if its whole block is kept.
 
     Args:
-        masks: the mask file of each image, or None if the whole image counts. Black pixels are left out or, for names
-            that begin with `DYNAMIC_MASK`, the other pixels.
+        masks: the mask file of each image, or None for an image without a mask. Black pixels are excluded; in
+            files named `DYNAMIC_MASK`..., all other pixels are.
         paths: the image files.
         images: the decoded images, which have the size of their masks or a smaller size. Each mask is rotated like its
             image. If the images are stored on disk, the masks are stored there too.
@@ -324,7 +324,7 @@ def drawn(mask: Image.Image, size: Sequence[int], turns: int, *, inverted: bool 
         mask: the opened mask file.
         size: (width, height) of the image as stored, or proportional to it.
         turns: quarter turns anticlockwise that make the image upright.
-        inverted: return whether a mask's pixel is black or transparent instead.
+        inverted: invert the result.
     """
     kept = np.asarray(mask.convert("L")) > (127 if isinstance(mask, JpegImageFile) else 0)
     if mask.has_transparency_data:

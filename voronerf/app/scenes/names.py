@@ -44,7 +44,7 @@ def plain(name: str) -> str:
 
 
 def _composed(name: str) -> str:
-    """Returns a name in one of its spellings in Unicode: macOS writes an umlaut as a letter and a mark."""
+    """Returns a name in composed Unicode (NFC), since macOS writes an umlaut as a letter and a combining mark."""
     return unicodedata.normalize("NFC", name)
 
 
@@ -61,7 +61,7 @@ def _without_suffix(name: str) -> str:
 
 
 Change = Callable[[str], str]
-#: The comparisons of a name and a file, the strictest first, as changes of (both, the name, the file).
+#: The comparisons of a name and a file, the strictest first: functions that normalise (both, the name, the file).
 LEVELS: tuple[tuple[Change, Change, Change], ...] = tuple(
     (fold, *cut)
     for fold in (_composed, _caseless)
@@ -70,7 +70,7 @@ LEVELS: tuple[tuple[Change, Change, Change], ...] = tuple(
 
 
 def compare(source: Path, names: Iterable[str], files: Sequence[str], found: dict[str, str], remedy: str) -> None:
-    """Adds the file of each name that has none yet to ``found``, by the first of `LEVELS` at which the two are equal.
+    """Adds to ``found`` a file for each name without one, by the first of `LEVELS` that makes name and file equal.
 
     A file belongs to one name: it is not taken if two names are equal to it, or if it is in ``found`` already.
 
@@ -78,8 +78,8 @@ def compare(source: Path, names: Iterable[str], files: Sequence[str], found: dic
         source: the file that lists the names, for error messages.
         names: normalised names, see `plain`.
         files: paths in a folder, separated by `/`.
-        found: the file of each name, where known.
-        remedy: the end of the message of the error for a name that may be several files.
+        found: the files found so far, by name; changed in place.
+        remedy: the end of the error message if several files match a name.
     """
     names = set(names)
     for fold, cut, cut_file in LEVELS:
@@ -102,12 +102,12 @@ Accepts = Callable[[int, list[str]], bool]
 
 
 def has_images(tail: int, rest: list[str]) -> bool:
-    """Returns whether a folder may have images; ``rest`` are the names that the folder of a listed name lacks."""
+    """Returns whether a folder may have images: ``rest`` (see `compare_tails`) names no masks, depths or the like."""
     return not any(map(OTHER_PICTURES.fullmatch, rest))
 
 
 def has_masks(tail: int, rest: list[str]) -> bool:
-    """Returns whether a folder may have masks: it is called so, or as the folder of a listed name."""
+    """Returns whether a folder may have masks: ``rest`` names masks, or ``tail`` > 0 (a listed folder's name)."""
     return tail > 0 or any(map(MASKS.fullmatch, rest))
 
 
@@ -120,18 +120,19 @@ def compare_tails(
     of_one_folder: bool,
     accepts: Accepts = lambda tail, rest: True,
 ) -> dict[str, str]:
-    """Returns files of names whose beginnings differ, as in paths of another machine; names without a file are absent.
+    """Matches names with files whose paths begin differently, as on another machine; returns the file of each match.
 
-    The names of one folder get files of one folder: of the same innermost name if there is such a folder, with files
-    for most names, and with the longest common tail of folders. `compare` compares the base names.
+    All names in one listed folder get files of one folder, chosen by these criteria in order: the same innermost
+    name, files for most names, the longest common end of its path. `compare` compares the base names.
 
     Args:
         source: the file that lists the names, for error messages.
         names: normalised names, see `plain`.
         files: paths in a folder, separated by `/`.
-        remedy: the end of the message of the error for a name that may be several files.
-        of_one_folder: whether the innermost folders must be equal. They must in any case if base names repeat.
-        accepts: whether files are taken of a folder with this number of common names, and these other names.
+        remedy: the end of the error message if several files match a name.
+        of_one_folder: whether the innermost folders must be equal, as they always must if base names repeat.
+        accepts: function that returns whether to take files of a folder: the last ``tail`` names of its path equal the
+            listed folder's, and ``rest`` are its other names.
     """
     listed, inside = _by_folder(names), _by_folder(files)
     bases = Counter(base for group in listed.values() for base in group)
@@ -175,19 +176,19 @@ def _by_folder(paths: Iterable[str]) -> dict[str, list[str]]:
 
 
 def _keys(base: str) -> set[str]:
-    """Returns a base name with and without its suffix, in one spelling and without upper case."""
+    """Returns a base name with and without its suffix, in normalised Unicode and lower case."""
     return {_caseless(base), _caseless(_without_suffix(base))}
 
 
 def _parts(folder: str) -> list[str]:
-    """Returns the names of a path of folders, the innermost first, in one spelling and without upper case."""
+    """Returns the names of a path of folders, the innermost first, in normalised Unicode and lower case."""
     return _caseless(folder).split("/")[::-1] if folder else []
 
 
 def split_by_lists(
     path: Path, kinds: Sequence[str], lists: Sequence[set[str]], names: Sequence[str], every: set[str]
 ) -> tuple[list[int], Tensor, int] | None:
-    """Returns the images in lists of names for training, for testing and for validation; None if all lists are empty.
+    """Splits images by lists of names for training, testing and validation; returns None if all lists are empty.
 
     An empty list for training or testing is filled with the images that are in no other list. Images for validation
     are used for testing if there is no list for testing; otherwise they are left out.
@@ -197,7 +198,7 @@ def split_by_lists(
         kinds: the names of the lists, for error messages.
         lists: the three sets of names.
         names: the names of the images, as in the lists.
-        every: these names, and the names of missing images.
+        every: ``names``, and the names of missing images.
 
     Returns:
         (the places of the chosen images in ``names``; bool held_out, True for test images; the number of images in
@@ -221,8 +222,9 @@ def split_by_lists(
 def listed_split(
     source: Path, folder: Path, names: Sequence[str], allow_outside: bool
 ) -> tuple[tuple[list[int], Tensor, int] | None, list[str]]:
-    """Reads the lists of names beside the images or a COLMAP model, see `TRAIN_LIST`; comments and empty lines may be
-    among the names.
+    """Splits images by the lists of names in the scene's folder or beside a COLMAP model, see `TRAIN_LIST`.
+
+    Comments and empty lines of a list are ignored.
 
     Args:
         source: the file with the cameras; `MODEL_LIST` lies beside it.

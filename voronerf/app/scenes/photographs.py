@@ -1,8 +1,8 @@
 """Makes a scene of photographs with known cameras: its kind, its frame, and its near and far bounds.
 
 c images, n sparse points. A scene is moved, turned and scaled so that the networks' inputs do not depend on the units
-of its files: the point that the cameras look at becomes the origin, their mean up direction becomes the z axis, and the
-farthest camera is at distance 1.
+of its files: the point that the cameras look at, or else their mean position, becomes the origin, their mean up
+direction becomes the z axis, and the farthest camera is at distance 1.
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def _listed_once(
 
 
 def _with_dynamic_masks(views: Sequence[View], folder: Path, allow_outside: bool) -> tuple[Sequence[View], list[str]]:
-    """Returns the views with instant-ngp's masks, see `DYNAMIC_MASK`, where they have no other masks; and notes."""
+    """Adds instant-ngp's masks, see `DYNAMIC_MASK`, to views without another mask; returns the views and notes."""
     masks = [view.path.with_name(f"{DYNAMIC_MASK}{view.path.stem}.png") for view in views]
     found = {place: mask for place, mask in enumerate(masks) if os.path.isfile(mask)}
     used = {place: mask for place, mask in found.items() if views[place].mask is None}
@@ -279,9 +279,9 @@ def _is_upright(view: View) -> bool:
 
 
 def _as_stored(view: View) -> View:
-    """Returns a view of a scene with cameras of upright pictures; its camera is turned to the stored picture.
+    """Turns the camera of a view from the upright to the stored picture, if the camera fits the upright picture.
 
-    The camera of a square picture, or of one that is upside down, fits both pictures, and is turned, too.
+    Only for scenes with cameras of upright pictures: the camera of a square or upside-down picture fits both pictures.
     """
     assert view.header is not None
     turns = view.header.turns
@@ -312,7 +312,7 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
 def _read_pictures(
     views: Sequence[View], poses: Tensor, factor: int, reading: Reading, source: Path, name: str
 ) -> tuple[Decoded, Tensor | None, str, tuple[str, ...]]:
-    """Reads images and masks of views; returns them, the kind of scene, and a note if alpha was used as a mask.
+    """Reads the images and masks of views; returns both, the kind of scene, and a note if alpha was used as a mask.
 
     An object keeps its alpha. In other scenes transparent pixels are masked, for example erased passers-by, or border
     pixels without colour after undistortion.
@@ -428,8 +428,9 @@ class Frame:
 def find_frame(poses: Tensor, kind: str, bounds: Tensor | None = None, *, normalise: bool = True) -> Frame:
     """Finds the coordinates of a scene.
 
-    The cameras' common focus, or else their mean position, becomes the origin. Their mean up direction becomes z, and
-    for a forward-facing scene their mean viewing direction becomes y. The farthest camera is at distance 1.
+    The origin is the cameras' focus or, without a focus and in forward-facing and inside-out scenes, their mean
+    position. The cameras' mean up direction becomes z, and for a forward-facing scene their mean viewing direction
+    becomes y. The farthest camera is at distance 1.
 
     With bounds, two kinds of scenes have another unit of length. In a forward-facing scene, it is the minimum of the
     views' least depths. In an inside-out scene, whose cameras may share one place, it is the distance of the farthest
@@ -529,7 +530,7 @@ def _kind(poses: Tensor, transparent: bool, cut_out: bool, panoramic: bool, read
 
 
 def _of_poses(poses: Tensor) -> Cameras:
-    """Returns cameras of which only the poses count."""
+    """Returns cameras with these poses and placeholder intrinsics."""
     return Cameras(poses, poses.new_ones(len(poses), 4), 1, 1)
 
 

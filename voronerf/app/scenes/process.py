@@ -6,7 +6,7 @@ can open them:
     features   `database.db`: the features of each image; `masks`: pixels that are neither transparent nor masked
     pairs      `few.db`: the largest features, matched between all images; `pairs.json`: the pairs to match
     matches    `database.db`: the matches of these pairs
-    cameras    `global` and, if this model has faults or loses cameras, `incremental`. A mapper runs again, on
+    cameras    `global` and, if this model has faults or lacks cameras, `incremental`. A mapper runs again, on
                `trusted.db`, if its model contradicts pairs of images (:mod:`voronerf.app.scenes.folds`). The best model
                becomes `OUT/sparse/0`, without cameras that see few points or lie far from the others
 
@@ -92,8 +92,8 @@ LEAST_SHARE, GOOD_SHARE = 0.5, 0.9
 #: the same number of matches between two images. If an image shares its lens with no other image, its points also
 #: determine the lens; its camera is lost too if it sees fewer than `ALONE_HELD` times the images' median.
 LEAST_HELD, ALONE_HELD = 15, 0.25
-#: The largest mean reprojection error of a sound model: in pixels, and as a fraction of the longer side, whichever is
-#: larger. With a phone's images of 4,032 pixels, trained fields are as good at an error of 2.04 as at 1.39.
+#: The largest mean reprojection error that is no fault of a model: in pixels, and as a fraction of the longer side,
+#: whichever is larger. With a phone's images of 4,032 pixels, trained fields are as good at 2.04 as at 1.39.
 LARGEST_ERROR, ERROR_SHARE = 2.0, 1 / 800
 #: The number of tracks per image that the global mapper uses to place cameras, longest first; triangulation adds the
 #: other tracks.
@@ -164,12 +164,12 @@ class Model:
 
     Attributes:
         folder: the folder of its files.
-        images: the images with a sound camera, sorted by name.
-        lost: the fault of each lost camera, by the name of its image.
+        images: the images whose cameras are kept, sorted by name.
+        lost: the reason why a camera was dropped, by its image's name.
         error: the mean reprojection error in pixels.
         faults: phrases that describe the model's faults, to be joined in one message.
-        contradicted: the number of strong pairs that its cameras contradict.
-        strong: the number of strong pairs of its images (:mod:`voronerf.app.scenes.folds`).
+        contradicted: the number of strong pairs (:mod:`voronerf.app.scenes.folds`) that its cameras contradict.
+        strong: the number of strong pairs of its images.
     """
 
     folder: Path
@@ -218,13 +218,13 @@ def process(
         matching: selection of image pairs: "exhaustive", all pairs; "sequential", neighbours by name; "auto", images
             whose largest features match, and the next two images by name.
         camera_model: COLMAP's name of the lens model.
-        mapper: "global", "incremental", or "auto": global, and also incremental if the global model has faults or loses
+        mapper: "global", "incremental", or "auto": global, and also incremental if the global model has faults or lacks
             cameras. If a model contradicts pairs of images, its mapper runs again on trusted pairs alone.
         max_features: the maximum number of features per image.
         size: the longer side in pixels to which images are reduced for finding features. COLMAP's default, 3,200,
             doubles the time for phones' images, but does not improve the trained fields.
         verbose: show COLMAP's log.
-        say: called with a line about each step.
+        say: called with each line of text for the user.
         progress: called with the name of a stage, the number of finished items, and the number of all items, 0 if
             unknown.
     """
@@ -539,9 +539,10 @@ def _sound(model: Model, least: float) -> bool:
 
 
 def _best(models: Sequence[Model], count: int) -> Model:
-    """Returns the best model: sound, not folded, with most cameras, fewest lost cameras and least error, in this order.
+    """Returns the best model of ``count`` images, by these criteria in order.
 
-    The models are of ``count`` images. A contradicted pair counts as a missing camera: it shows that cameras are wrong.
+    No faults and enough cameras; not folded; most cameras; fewest dropped cameras; least error. A contradicted pair
+    counts as a missing camera, since it shows that cameras are wrong.
     """
 
     def worth(model: Model) -> tuple[float, ...]:
@@ -608,7 +609,7 @@ def _map(stages: Stages, name: str, database: Path, matches: Matches, strong: Se
 
 
 def _lost(model: ColmapModel) -> dict[str, str]:
-    """Returns a model's images with lost cameras, and the reason: few points, or a place far from other cameras."""
+    """Returns why cameras of a model are dropped, by image name: few points, or a place far from other cameras."""
     far = lost_cameras(torch.from_numpy(np.stack([image.pose[:3, 3] for image in model.images])))
     held, uses = [len(points_seen(image, model)) for image in model.images], Counter(i.camera for i in model.images)
     usual, lost = float(np.median(held)), {}
@@ -638,7 +639,7 @@ def _contradiction(model: Model) -> str:
 
 
 def _write_sound(colmap: Any, model: Model, folder: Path) -> None:
-    """Writes the cameras, images and points of a model, without its lost images."""
+    """Writes the cameras, images and points of a model, without the images whose cameras are dropped."""
     part = emptied(folder.with_name(f".{folder.name}"))
     with named_errors(f"pycolmap: {model.folder}"):
         reconstruction = colmap.Reconstruction(model.folder)

@@ -17,9 +17,10 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.scene import KnownDepths, Scene
 from voronerf.nerf.contraction import Contraction
 
-#: The fraction of the points beyond the sides of the outer boxes, along each axis and on each side: strays of a model.
+#: The fraction of a sparse model's points, at each end of each axis, that count as outliers and lie outside all boxes.
 STRAYS = 0.002
-#: The minimum fraction of the pixels of a test view whose rays meet the region; at most half of the largest fraction.
+#: A test view is kept if the rays of at least this fraction of its pixels meet the region, or half of the largest such
+#: fraction of a view, whichever is smaller.
 SEEN = 0.2
 
 
@@ -58,10 +59,11 @@ def region_of(scene: Scene, box: Tensor) -> Scene:
 
 
 def tiles(scene: Scene, count: int) -> list[Tensor]:
-    """Divides a scene into boxes [2, 3] with equally many points, which fill the box around them without gaps.
+    """Divides a scene into boxes [2, 3] with equally many points, which fill the box of the scene without gaps.
 
-    The points belong to the sparse model; without one, they are the positions of the cameras. The longest side of the
-    box is divided first, as in a k-d tree (Bentley 1975); in the middle if that leaves no point on one side.
+    The points are the sparse model's or, without a model, the positions of the cameras; a scene without a box gets the
+    box of the points. A box is divided along its longest side, as in a k-d tree (Bentley 1975): between points, or in
+    the middle if that border is outside the box.
 
     Args:
         scene: The scene.

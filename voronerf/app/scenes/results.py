@@ -65,7 +65,7 @@ def read_pairs(path: Path, names: Collection[str]) -> list[Pair]:
 
 
 def check_database(colmap: Any, path: Path, sizes: Mapping[str, tuple[int, int]]) -> None:
-    """Raises SceneError unless a database has whole features and matches, and only of the images in ``sizes``.
+    """Raises SceneError unless the features and matches in a database are valid, and all belong to images in ``sizes``.
 
     ``sizes`` maps the images' names to their sizes. Some of COLMAP's solvers crash for positions far from an image.
     """
@@ -99,9 +99,9 @@ def check_database(colmap: Any, path: Path, sizes: Mapping[str, tuple[int, int]]
 
 
 def _wrong_matrices(path: Path) -> dict[str, tuple[Any, Any] | None]:
-    """Returns the rows and columns of a wrong matrix in each table of a database, or None for a sound table.
+    """Returns (rows, columns) of an invalid matrix in each table of a database; None for a table without one.
 
-    COLMAP allocates and copies them before it compares their size with the stored bytes, and not in all cases.
+    COLMAP allocates and copies a matrix before it compares the size with the stored bytes, if it compares them at all.
     """
     import sqlite3  # some Pythons lack it
 

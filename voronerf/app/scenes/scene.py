@@ -95,10 +95,10 @@ class Scene:
         box: float32 [2, 3], lowest and highest corner of an axis-aligned box around the scene, or None if unknown.
         background: the colour behind transparent pixels, "white"; None for opaque images.
         kind: "object" on white, "forward" (cameras look the same way), "inside-out" or "unbounded", see `KINDS`.
-        contraction: the contraction that makes the space of a scene without a box finite, or around a region of a
-            scene; None for the sphere around the box, or around the origin and all cameras.
+        contraction: the contraction of a scene without a box, or around a region of a scene; None to derive a sphere
+            from the box or the cameras, see :meth:`space`.
         region: float32 [2, 3], the box that the rays of all trained pixels meet; None for the whole scene.
-        transform: float64 [4, 4], transform from the files' coordinates to the scene's, or None if it was not moved.
+        transform: float64 [4, 4], transform from the files' coordinates to the scene's; None for none, or if unknown.
         notes: lines about how the files were read.
 
     Examples:

@@ -22,7 +22,7 @@ LOST, EXTENT = 8.0, 1 / 3
 #: position exceeds `APART` times the quantile `MOST` of these distances.
 APART, MOST = 10.0, 0.8
 #: The check for a collapse (see `COLLAPSED`) ignores lost cameras if they are at most this fraction of all cameras, or
-#: a single camera. If more cameras count as lost, they may be the sound ones, and the others may have collapsed.
+#: a single camera. If more cameras count as lost, they may be correct, and the others may have collapsed.
 FEW = 0.1
 #: The maximum number of cameras whose pairwise distances are measured.
 MOST_CAMERAS = 1000
@@ -94,7 +94,7 @@ def camera_faults(
 
 
 def spread_of_lenses(lenses: Sequence[tuple[Lens, float]]) -> str:
-    """Returns a phrase about images with a lens each whose focal lengths differ much; empty for plausible lenses.
+    """Returns a phrase if every image has a lens of its own and the focal lengths differ much; otherwise "".
 
     Args:
         lenses: the lens of each image, and the longer side of the image in pixels.

@@ -178,7 +178,7 @@ def _digest(value: Any) -> str:
 class Pages:
     """A prefetcher for the pages of a mapped tensor.
 
-    Without it, pages that are not in memory are read one by one, when they are touched, although a disk serves many
+    Without prefetching, pages that are not in memory are read one by one, on first access, although a disk serves many
     requests at a time.
 
     Args:

@@ -87,9 +87,9 @@ class ListedImage(NamedTuple):
 def read_transforms(path: Path, allow_outside: bool = False, *, all_may_miss: bool = False) -> Listing:
     """Reads a transforms file and finds its images, see `find_files`.
 
-    Listed images that are missing are left out, with a warning that tells their number. It is an error if all images
-    are missing, unless ``all_may_miss`` is set. Frames without a pose are left out, with a note, unless all frames are.
-    The frames stay in the file's order.
+    Listed images that are missing are left out, with a warning that tells their number; if all are missing, it is an
+    error unless ``all_may_miss`` is set. Frames without a pose are left out, with a note; if all frames lack a pose, it
+    is an error. The frames stay in the file's order.
     """
     try:
         entries = read_json(path)
@@ -201,7 +201,7 @@ def is_text(name: str) -> bool:
 
 
 def _exact_file(folder: Path, name: str) -> Path | None:
-    """Returns the file as it is named; Blender's names lack the suffix, and names from Windows may have backslashes."""
+    """Returns the file of a name, or None; Blender's names lack a suffix, and names from Windows have backslashes."""
     spellings = dict.fromkeys((name, name.replace("\\", "/")))
     suffixes = SUFFIXES[:1] if SUFFIX.search(name) else SUFFIXES  # 0.jpg.png is a mask of 0.jpg
     paths = (Path(f"{folder / spelling}{suffix}") for spelling in spellings for suffix in suffixes)
@@ -216,7 +216,7 @@ def _find_masks(
     Args:
         source: the transforms file.
         frames: each frame, and its name for error messages.
-        images: the image files, which are no masks.
+        images: the image files, which are not taken as masks.
         allow_outside: whether masks may lie outside of the scene's folder.
     """
     folder, exact, names = source.parent, dict[str, Path](), []
@@ -242,7 +242,7 @@ def _find_masks(
 
 
 def _is_unknown(matrix: object) -> bool:
-    """Returns whether a pose is missing, or has entries that are missing or not finite, as of a lost camera."""
+    """Returns whether a pose is missing, or has entries that are null or not finite, as for an unknown camera."""
     rows = matrix if isinstance(matrix, list) else []
     values = [value for row in rows for value in (row if isinstance(row, list) else ())]
     return matrix is None or any(
@@ -528,7 +528,7 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
 
 
 def _image_size(path: Path, values: dict[str, Any]) -> tuple[int, int] | None:
-    """Returns the size of a frame's image in the folder or by its principal point; None for a lens in other units."""
+    """Returns the size of a frame's image: its file's, or twice the principal point; None for a lens not in pixels."""
     name, (cx, cy) = values.get("file_path"), (number(values, key, path, positive=True) for key in ("cx", "cy"))
     if not any(values.get(key) for key in ("fl_x", "fl_y", "cx", "cy")):
         return None

@@ -163,7 +163,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 def no_run(path: Path, file: str) -> str:
     """Returns the error message for a path without a run, in which ``file`` is missing.
 
-    It suggests a run that contains the path, lies in it, or has a similar name.
+    The message suggests a run that contains the path, lies in it, or has a similar name.
     """
     reason = f"there is no {file} in it" if path.is_dir() else "it is a file" if path.is_file() else None
     parents = [folder for folder in path.parents if (folder / "config.json").is_file()]

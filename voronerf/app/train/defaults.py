@@ -44,8 +44,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
     """Returns the settings with every default filled in, except ``width`` and ``lr`` if ``parameters`` determines them.
 
     Contraction, occupancy, sparse depth, rays, samples per ray, and the options of the field have such defaults.
-    ``speed`` is the speed of this machine relative to the one on which the defaults were measured. It has no effect if
-    the length of the training is a number of steps, since the same seed should give the same networks on every machine.
+    ``speed`` is this machine's speed, see `machine_speed`. It has no effect if the length of the training is a number
+    of steps, since the same seed should give the same networks on every machine.
     """
     kind, boxed = config.field_type, scene.box is not None
     contraction, sparse_depth, rays, samples = config.contraction, config.sparse_depth, config.rays, config.samples
@@ -103,8 +103,8 @@ def resolve(config: TrainConfig, scene: Scene, speed: float = 1.0) -> TrainConfi
 def unseen_share(scene: Scene, space: Space) -> float:
     """Returns the fraction of a training in which batches have unseen rays; 0 for no unseen rays.
 
-    Unseen rays begin at positions without a camera. Only photographs by cameras around a place, with a sparse model,
-    have them, but not regions. The fraction is larger if fewer image tiles have points of the sparse model, since
+    Unseen rays begin at positions without a camera. They need photographs around a place and a sparse model; regions
+    get none. The fraction is larger if fewer image tiles have points of the sparse model, since
     surfaces without texture have few points.
     """
     points, cameras = scene.train.sparse_depth, scene.train.cameras
@@ -126,8 +126,8 @@ def unseen_move(scene: Scene, space: Space) -> float:
 def machine_speed() -> float:
     """Returns the CPU's speed relative to the two cores on which the defaults were measured: 1, 2, 4, ...
 
-    It is measured in 0.1 s by the multiply-adds of all threads. It is rounded to a power of two for reproducible
-    settings, and at least 1, so that load by other processes cannot make the settings worse.
+    The speed is measured in 0.1 s by the multiply-adds of all threads, and rounded to a power of two for reproducible
+    settings. It is at least 1, so that load by other processes cannot make the settings worse.
     """
     if native.missing(torch.device("cpu")) is not None:
         return 1.0
@@ -135,7 +135,7 @@ def machine_speed() -> float:
 
 
 def why_no_occupancy(config: TrainConfig) -> str | None:
-    """Returns the reason why settings exclude skipping of empty space; None if they allow it."""
+    """Returns the reason why settings exclude skipping of empty space; None if the settings allow it."""
     if config.field_type.cones:
         return f"--field {config.field}, which takes cones"
     return None if SAMPLERS[config.sampling].skips else f"--sampling {config.sampling}"

@@ -181,7 +181,7 @@ def restore_routers(routers: Mapping[str, VoronoiRouter], checkpoint: Checkpoint
 def open_routers(
     config: TrainConfig, checkpoint: Checkpoint, device: torch.device | str, backend: str
 ) -> dict[str, VoronoiRouter]:
-    """Returns a checkpoint's routers with averaged weights, in eval mode; on the CPU they have its tensors."""
+    """Returns a checkpoint's routers with averaged weights, in eval mode; on the CPU they share the tensors."""
     check_shapes(config, checkpoint)
     routers = make_routers(config, device)
     restore_routers(routers, checkpoint, assign=torch.device(device).type == "cpu")

@@ -72,13 +72,13 @@ def rate_advice(config: TrainConfig, *, lower: bool = False) -> str:
 
 
 def steps_to_judgement(state: State) -> int:
-    """Returns the number of steps until :func:`judge_start` judges the start; `GROUP` if it will not judge it."""
+    """Returns the number of steps until :func:`judge_start` judges the start; `GROUP` if no judgement follows."""
     remaining = judged_at(state) - state.step
     return remaining if remaining > 0 else GROUP
 
 
 def judged_at(state: State) -> int:
-    """Returns the step after which a start is judged; 0 if it is not judged."""
+    """Returns the step after which a start is judged; 0 without an occupancy grid, since the start is not judged."""
     grid, first = state.sampler.grid, state.sampler.settling_steps
     return 0 if grid is None else state.began + max(first, grid.settled or 0) + JUDGED
 

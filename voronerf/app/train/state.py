@@ -175,7 +175,7 @@ class State:
         return not isinstance(router.program(*_samples(6 if self.renderer.cones else 3), trace=True), str)
 
     def learning_rate(self) -> float:
-        """Returns the learning rate of the next step, which is computed at the middle of its group of steps."""
+        """Returns the learning rate of the next step: the schedule's rate at the middle of its `GROUP` of steps."""
         group = schedule.GROUP
         middle = self.step - (self.step - self.began) % group + group // 2
         highest, hold = float(self.config.lr or 0) / self.relative_length, self.config.field_type.lr_hold
@@ -205,7 +205,7 @@ class State:
         return max((stage.started_at_step for stage in self.stages if stage.cells == 1), default=0)
 
     def agree(self, steps: int) -> int:
-        """Copies times and the number of rays from rank 0 to all ranks; returns rank 0's ``steps``, 0 at the end."""
+        """Copies times and the number of rays from rank 0 to all ranks; returns rank 0's ``steps`` (0: no more)."""
         names = "seconds", "evaluation_seconds", "reserved_seconds", "rays"
         numbers, steps = self.ranks.first(([getattr(self, name) for name in names], steps))
         for name, number in zip(names, numbers, strict=True):

@@ -146,7 +146,7 @@ class Client:
         return True
 
     def change(self, **look: Any) -> None:
-        """Requests new pictures, with the given fields of the `Look` changed."""
+        """Replaces the fields ``look`` of the browser's `Look`, and requests new pictures."""
         self.look = replace(self.look, **look)
         self.version += 1
         if time.perf_counter() - self.moved_at > PAUSE:

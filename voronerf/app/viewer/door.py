@@ -54,7 +54,7 @@ def chosen(part: Any) -> Any:
 def guarded(host: str, pages: Mapping[str, Callable[[], Awaitable[bytes]]]) -> Iterator[None]:
     """A context in which to make a viser server, which then refuses requests from pages of other sites.
 
-    The server, which listens at `host`, ignores messages that the viewer does not use, and disconnects a browser whose
+    The server, which listens on `host`, ignores messages that the viewer does not use, and disconnects a browser whose
     message cannot be decoded. It also serves ``pages``, HTML by path.
     """
     serve, guarded_hosts = server.serve, []
@@ -119,7 +119,7 @@ def why_refused(headers: Mapping[str, str], host: str) -> str | None:
 
     Args:
         headers: the headers of the request.
-        host: the address or name of this machine at which the viewer listens.
+        host: the address or name of this machine on which the viewer listens.
 
     Examples:
         >>> from voronerf.app.viewer.door import why_refused

@@ -22,11 +22,11 @@ def watch(state: State, scores: Scores, *, host: str = "127.0.0.1", port: int = 
     Args:
         state: The viewed training.
         scores: The scores whose curve is shown.
-        host: Address to listen at.
-        port: Port to listen at; 0 is any free port.
+        host: Address to listen on.
+        port: Port to listen on; 0 is any free port.
 
     Raises:
-        ConfigError: The address cannot be listened at.
+        ConfigError: The address is unavailable.
     """
     return Training(Viewer(subject_of(state, scores), host=host, port=port), state, scores)
 

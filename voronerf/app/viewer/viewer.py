@@ -57,12 +57,12 @@ class Viewer:
 
     Args:
         subject: The viewed run or training.
-        host: Address to listen at.
-        port: Port to listen at; 0 is any free port.
+        host: Address to listen on.
+        port: Port to listen on; 0 is any free port.
         page: Returns the page that draws the subject in the browser itself, served at `PAGE`; None for no page.
 
     Raises:
-        ConfigError: The server cannot listen at the address.
+        ConfigError: The address is unavailable.
     """
 
     def __init__(
@@ -264,7 +264,7 @@ class Viewer:
 
 
 def check_address(host: str, port: int) -> None:
-    """Raises ConfigError if a server cannot listen at the address."""
+    """Raises ConfigError if a server cannot listen on the address."""
     if not 0 <= port <= 65535:
         raise ConfigError(f"--port must be 0 to 65535, got {port}")
     try:
@@ -281,11 +281,11 @@ def view_run(run: Run, *, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
 
     Args:
         run: The run from `voronerf.app.open_run`.
-        host: Address to listen at.
-        port: Port to listen at; 0 is any free port.
+        host: Address to listen on.
+        port: Port to listen on; 0 is any free port.
 
     Raises:
-        ConfigError: The server cannot listen at the address.
+        ConfigError: The address is unavailable.
     """
     try:
         packed: Packed | None = pack(run)

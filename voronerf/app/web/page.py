@@ -108,7 +108,7 @@ def turntable(run: Run, frames: int = FRAMES) -> bytes:
 
 
 def wide_enough(cameras: Cameras, points: Tensor) -> Cameras:
-    """Returns the cameras with shorter focal lengths (at least half), so that they show all points [n, 3]."""
+    """Divides focal lengths by the least factor with which all cameras show all points [n, 3], clamped to 1..2."""
     x, y, z = ((points - cameras.origins[:, None]) @ cameras.poses[:, :3, :3]).unbind(-1)  # [frames, n] each
     fx, fy, cx, cy = cameras.intrinsics[:, :, None].unbind(1)
     share = torch.where(z < 0, torch.maximum(x.abs() * fx / cx, y.abs() * fy / cy) / -z, 0).amax()

@@ -1,9 +1,9 @@
-"""Generates the WGSL shader of a run: constants, march.wgsl, and the networks step by step.
+"""Generates the WGSL shader of a run: constants, march.wgsl, and the program of the networks.
 
-A field is a program (`voronerf.ops._core.program`). Each value of the program becomes an array of vec4f, with four
-columns in each vec4f; padding lanes are finite, and their weights are 0. A matrix becomes blocks of four outputs and
-four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes. `ParameterOffsets` has the offsets of
-a cell's blocks and biases; `voronerf.app.web.packing` writes them.
+A field is a program, a list of operations called steps (`voronerf.ops._core.program`). The result of a step becomes an
+array of vec4f, with four columns in each vec4f; padding lanes are finite, and their weights are 0. A matrix becomes
+blocks of four outputs and four inputs, since a product of a mat4x4f and a vec4f needs no sums across lanes.
+`ParameterOffsets` has the offsets of a cell's blocks and biases; `voronerf.app.web.packing` writes both.
 
 o outputs and i inputs of a matrix, w columns.
 """
@@ -60,7 +60,7 @@ class ParameterOffsets:
     """The offsets of a cell's parameters, counted in float16 elements from the cell's first parameter.
 
     Attributes:
-        matrices: For each step of the network that reads a matrix: the number of the parameter, its first column that
+        matrices: For each step of the program that reads a matrix: the number of the parameter, its first column that
             is read, rows o, columns i, and the offset of the matrix, which is stored in blocks.
         vectors: For each bias: the number of the parameter, its first element that is read, width, and offset.
         size: Number of parameters of a cell, including padding.
@@ -86,7 +86,7 @@ def networks_text(networks: Networks, layout: ParameterOffsets) -> str:
     """Returns the WGSL function ``evaluate``, which computes colour and density at a position; fills ``layout``.
 
     Raises:
-        CannotDraw: A step has no counterpart in WGSL, or a sample needs more than `MOST_NUMBERS`.
+        CannotDraw: A step of the program has no counterpart in WGSL, or a sample needs more than `MOST_NUMBERS`.
     """
     program = networks.program
     numbers = sum(4 * fours(step.width) for step in program.steps)
@@ -124,7 +124,7 @@ def _is_relu_of(after: Step, step: Step) -> bool:
 def _step(
     program: Program, step: Step, name: str, layout: ParameterOffsets, grids: list[HashGrid], steps: dict[int, Step]
 ) -> list[str]:
-    """Returns the WGSL lines of a step."""
+    """Returns the WGSL lines of a step of the program."""
     out, wide = f"v{step.out}", fours(step.width)
     declare = f"var {out}: array<vec4f, {wide}>;"
     loop = f"for (var o = 0u; o < {wide}u; o++)"
@@ -170,7 +170,7 @@ def _step(
 
 
 def _linear(program: Program, step: Step, name: str, layout: ParameterOffsets, steps: dict[int, Step]) -> list[str]:
-    """Returns the WGSL lines of a linear step, block by block, with its bias."""
+    """Returns the WGSL lines of a linear layer, block by block, with its bias."""
     matrix, start, transposed = map(int, step.numbers)
     if transposed or name not in ("", "relu"):
         raise CannotDraw("its networks have a transposed product")

@@ -98,7 +98,7 @@ class Capture:
                 _FREED.clear()
 
     def __del__(self) -> None:
-        """Hands the graph on if it must not be destroyed yet; the garbage collector may run at any time."""
+        """Keeps the graph alive while another capture runs; the garbage collector may call this at any time."""
         if _RUNNING:
             _FREED.append(self._graph)
 

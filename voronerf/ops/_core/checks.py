@@ -54,7 +54,7 @@ def to_common_dtype(points: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
 
 def dtype_under_autocast(dtype: torch.dtype, tensor: Tensor) -> torch.dtype:
     """Returns the dtype in which layers of a dtype run: autocast's on the device of a tensor, except for float64."""
-    kind = "cpu" if tensor.is_cpu else tensor.device.type  # `type` makes a new text, which takes longer than the rest
+    kind = "cpu" if tensor.is_cpu else tensor.device.type  # reading `type` makes a text, which takes longer
     if torch.is_autocast_enabled(kind) and dtype is not torch.float64:
         return torch.get_autocast_dtype(kind)
     return dtype
@@ -63,7 +63,7 @@ def dtype_under_autocast(dtype: torch.dtype, tensor: Tensor) -> torch.dtype:
 def facts(op: str, name: str, tensor: Any) -> tuple[Any, ...]:
     """Returns the shape, strides and dtype of a dense tensor, and the type and index of its device.
 
-    The compiled module checks these facts if torch gives no view of the tensor, such as a subclass.
+    The compiled module checks these facts if torch gives no view of the tensor, for example of a subclass.
     """
     check_tensor(op, name, tensor)
     device = tensor.device
@@ -115,20 +115,20 @@ class Default(NamedTuple):
 
 TensorRules = Sequence[TensorRule | Default]
 Others = tuple[Sequence[TensorRule], Sequence[Any]]
-"""Additional rows, and one tensor for each row."""
+"""Additional rules, and one tensor for each rule."""
 
 
 def check_rules(
     op: str, make: Callable[..., TensorRules], tensors: list[Any], *arguments: Any, smooth: bool = True
 ) -> dict[str, int]:
-    """Checks each tensor against one row of a table; the number of rows depends on the network.
+    """Checks a list of tensors, such as the tensors of a network, against a list of rules.
 
-    The compiled module reads the rows once and then checks all tensors of the network.
+    The compiled module reads the rules once for the same ``arguments``, and checks all tensors in one call.
 
     Args:
         op: the operation's name, for errors.
-        make: the function that returns the rows.
-        tensors: one tensor for each row.
+        make: the function that returns the rules.
+        tensors: one tensor for each `TensorRule`, in order.
         arguments: the arguments of ``make``; they must be hashable.
         smooth: whether autograd saves the tensors; if so, inference tensors are refused.
 
@@ -156,7 +156,7 @@ def check_rules(
 
 @functools.lru_cache(maxsize=4096)
 def _compiled(make: Callable[..., TensorRules], *arguments: Any) -> Any:
-    """Returns a compiled function from the op's name, tensors and ``smooth`` to the letters' sizes."""
+    """Returns a compiled function that checks tensors: (op's name, tensors, ``smooth``) -> the letters' sizes."""
     return backends.compiled().TensorRules(make(*arguments))
 
 

@@ -77,7 +77,7 @@ class _Fields:
         self.nested = any(kind is not None for kind in self._kinds)
 
     def packed(self, flat: Sequence[Any]) -> Sequence[Any]:
-        """Returns the arguments of the op."""
+        """Returns the op's arguments, made from the flat arguments of the custom op."""
         if not self.nested:
             return flat
         arguments, start = [], 0
@@ -89,7 +89,7 @@ class _Fields:
         return arguments
 
     def flat(self, packed: Sequence[Any]) -> Sequence[Any]:
-        """Returns the arguments of the custom op."""
+        """Returns the flat arguments of the custom op, made from the op's arguments."""
         if not self.nested:
             return packed
         flat: list[Any] = []
@@ -212,7 +212,7 @@ class Op:
         return self._as_declared(_apply_node(*entries, self, arguments))
 
     def _tensors_of(self, flat: Sequence[Any]) -> list[Any]:
-        """Returns the entries of the custom op's lists, then its arguments that are tensors or None."""
+        """Returns the tensors among the custom op's arguments: the entries of lists, then single tensors or None."""
         entries: list[Any] = []
         for place in self._lists:
             entries += flat[place]
@@ -269,7 +269,7 @@ class Op:
         return tuple(self._fields.flat(gradients if isinstance(gradients, tuple) else (gradients,)))
 
     def flat_gradients(self, ctx: Any, of_results: Sequence[Any]) -> tuple[Any, ...]:
-        """Returns the results of `gradients` for the gradients of the results in one sequence."""
+        """Calls `gradients` with the gradients of the results, which are passed as one sequence."""
         return self.gradients(ctx, of_results) if self._listed else self.gradients(ctx, *of_results)
 
     def results(self, arguments: Sequence[Any]) -> Any:
@@ -278,7 +278,7 @@ class Op:
         return tuple(results) if self._listed else results
 
     def arguments(self, entries: Sequence[Any], lengths: Sequence[int]) -> Sequence[Any]:
-        """Rebuilds the op's arguments from the custom op's arguments with flattened lists, and the lists' lengths."""
+        """Returns the op's arguments, from the results of `_flattened`."""
         return self._fields.packed(_nested(entries, lengths))
 
 

@@ -104,7 +104,7 @@ class Argument(NamedTuple):
         return self.kind is Tensor and (not self.rule.dtypes or bool({*self.rule.dtypes} & {*FLOATING}))
 
     def check(self, op: str, value: Any) -> Any:
-        """Checks the value of an argument that is no tensor, and returns it; a number as a float if it must be one."""
+        """Checks and returns the value of an argument that is no tensor; converts it to float for a float argument."""
         name, kind, rule = self.name, self.kind, self.rule
         if kind is int:
             checks.check_integer(op, name, value, *rule)
@@ -121,7 +121,7 @@ class Argument(NamedTuple):
 
 
 class Binding(NamedTuple):
-    """The binding of a parameter of a compiled function, or of a member of its structs.
+    """The source of a parameter of a compiled function, or of a member of the function's structs.
 
     Attributes:
         get: a function that returns the parameter, given the arguments of an op and the memory for its results.
@@ -132,7 +132,7 @@ class Binding(NamedTuple):
     plan: tuple[Any, ...]
 
     def __call__(self, arguments: Any) -> Any:
-        """Returns the parameter, which must depend on the arguments alone or on the results alone."""
+        """Returns the parameter; ``arguments`` are the op's arguments, or the results if it reads only results."""
         return self.get(arguments, arguments)
 
 
@@ -229,9 +229,9 @@ class Declaration:
         return {**letters, **{letter: _size_of(sorted(letter_ways)) for letter, letter_ways in ways.items()}}
 
     def _likes(self) -> list[tuple[str, torch.dtype | None]]:
-        """Returns for each result the argument whose device the result has, and the dtype of the result.
+        """Returns for each result the name of an argument on the same device, and the dtype of the result.
 
-        The dtype is None if the result also has the argument's dtype.
+        The dtype is None if the result has the dtype of this argument.
         """
         tensors, likes = [arg for arg in self._tensors() if not arg.optional], list[tuple[str, torch.dtype | None]]()
         for result in self.results.values():

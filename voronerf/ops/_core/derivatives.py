@@ -40,7 +40,7 @@ def needed_gradients(ctx: Any, inputs: Sequence[Tensor | None]) -> list[bool]:
     return answers[::-1]
 
 
-# torch has no public names for these; without the function every gradient is computed.
+# torch has no public names for this function and class. Without the function, every gradient is computed.
 _ask = getattr(torch._C, "_will_engine_execute_node", None)
 _LEAF = getattr(torch._C._functions, "AccumulateGrad", None)
 

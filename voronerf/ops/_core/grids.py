@@ -26,8 +26,8 @@ class GridLevel(NamedTuple):
     ``i + side * j + side**2 * k`` modulo ``entries``. In a hashed level the index is the lowest bits of
     ``i ^ 2654435761 j ^ 805459861 k`` in unsigned 32-bit arithmetic."""
 
-    scale: float  # the box's side in grid cells
-    shift: float  # the offset of a position, in cells
+    scale: float  # the box's side in voxels
+    shift: float  # the offset of a position, in voxels
     side: int  # stride of the second axis
     entries: int  # the level's entries; a power of two if hashed
     offset: int  # the level's first entry in the table
@@ -50,7 +50,7 @@ class HashGrid:
         box: the smallest and the largest corner of the space, three numbers each. A point outside the box has the
             features of the nearest point inside.
         convention: the library whose table layout is used. "tiny-cuda-nn" (and instant-ngp): corners are shifted by
-            half a cell, and a level of resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with
+            half a voxel, and a level of resolution N has N corners along an axis. "torch-ngp" (its gridencoder, with
             ``align_corners=False``): the same shift with N + 1 corners. "nerfstudio" (``HashEncoding`` in PyTorch, and
             HashNeRF): no shift, integer resolutions, and hashes on every level.
         text: the grid as JSON; :meth:`parse` reads it.

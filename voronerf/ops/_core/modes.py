@@ -14,10 +14,10 @@ _set_flag = getattr(_python_dispatch, "set_is_in_mode_without_ignore_compile_int
 
 
 def run_within(mode: TorchDispatchMode, function: Callable[[], T]) -> T:
-    """Runs a function within a mode. The mode also ends if Ctrl-C interrupts the end of torch's context.
+    """Runs a function within a mode, and ends the mode even if Ctrl-C interrupts the exit from torch's context.
 
-    Otherwise the mode would see all further calls of the thread, and torch's compiler would skip all functions. It
-    would also do so after modes in several threads at once.
+    A mode that did not end would see all further calls of the thread, and torch's compiler would skip all functions.
+    The flags of modes are restored, since modes in several threads at once may leave them set, with the same effect.
     """
     modes = torch._C._len_torch_dispatch_stack()
     # Modes belong to a thread, but their flags to the process: another thread may have set them.

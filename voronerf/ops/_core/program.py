@@ -735,7 +735,7 @@ def gradient(
 def gradient_reaches(program: Program, outputs: Sequence[bool], sums: Sequence[bool]) -> tuple[bool, ...]:
     """Returns for each input, then for each parameter, whether a gradient reaches it; else autograd gives it None.
 
-    Nothing passes ``stop`` or a comparison. A gradient of zeros, as ``floor`` has, counts as a gradient; so does
+    No gradient passes ``stop`` or a comparison. A gradient of zeros, as ``floor`` has, counts as a gradient; so does
     the second derivative of ReLU, whose gradient is a ``gate`` by its output.
 
     Args:

@@ -68,7 +68,7 @@ class _Computed(NamedTuple):
 
 
 class Recording(TorchDispatchMode):
-    """The recorded calls of a function, which runs in :meth:`record`, or within this context; either once.
+    """The recorded calls of a function, which runs once: in :meth:`record`, or in a ``with`` block.
 
     Attributes:
         obstacle: The reason why the calls cannot be replayed; None if they can.
@@ -95,7 +95,7 @@ class Recording(TorchDispatchMode):
         from voronerf.ops._core import native
 
         self._compiled, self._calls = native.compiled, native.compiled.Recording()
-        self._counts = list[Count]()  # numbers of rows that functions return before each run
+        self._counts = list[Count]()  # numbers of rows that functions return before each replay
         self._numbers = list[tuple[ctypes.c_float, Tensor, Callable[[], float]]]()
         self._drawn, self._computed = list[Tensor](), list[_Computed]()
         self._inputs, self._taken = list[Tensor](), list[Tensor]()  # memory for the inputs, and the inputs of this run
@@ -133,7 +133,7 @@ class Recording(TorchDispatchMode):
         self._refuse(self._calls.obstacle)
 
     def record(self, function: Callable[[], Any]) -> Any:
-        """Runs a function and records its calls. Unlike the context, it also ends if Ctrl-C interrupts its end."""
+        """Runs a function and records its calls. Unlike ``with``, always stops, even if Ctrl-C interrupts the exit."""
         try:
             return run_within(self, function)
         finally:
@@ -157,7 +157,7 @@ class Recording(TorchDispatchMode):
         self._calls.hold_tensor(tensor)
 
     def count(self, source: Callable[[], int]) -> int:
-        """Returns the number of rows of this run; replays call ``source`` for the number before each run."""
+        """Returns the number of rows of this run; each replay first calls ``source`` for its number."""
         with self._paused():
             memory = torch.empty(1, dtype=torch.int64, device="cpu")
         ctypes.c_int64.from_address(memory.data_ptr()).value = source()
@@ -180,7 +180,7 @@ class Recording(TorchDispatchMode):
         return count
 
     def vary(self, value: Callable[[], float]) -> Tensor:
-        """Returns a number that varies from run to run, float32 []."""
+        """Returns the result of ``value`` as float32 []; each replay first calls ``value`` again."""
         with self._paused():
             number = torch.empty((), dtype=torch.float32, device="cpu")
         memory = ctypes.c_float.from_address(number.data_ptr())

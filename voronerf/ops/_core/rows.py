@@ -23,7 +23,7 @@ class Count:
     Attributes:
         memory: The number, int64 [1].
         capacity: The largest number for which memory is allocated.
-        read: The function that returns the number before each run; None if a compiled call computes it.
+        read: The function that returns the number before each replay; None if a compiled call computes it.
     """
 
     __slots__ = ("_number", "capacity", "memory", "read")
@@ -121,5 +121,5 @@ def following_count(rows: int, follows: Callable[[int], int]) -> int:
 
 
 def varying(value: Callable[[], float]) -> float | Tensor:
-    """Returns a number that varies from run to run, rounded to float32; in a recording or capture it is a tensor []."""
+    """Returns a number that varies between replays, rounded to float32; in a recording or capture it is a tensor []."""
     return ctypes.c_float(value()).value if active.vary is None else active.vary(value)

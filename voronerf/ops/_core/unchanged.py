@@ -20,7 +20,7 @@ class Stale:
         return False
 
     def _note(self, *noted: Any) -> None:
-        """Ignores the objects."""
+        """Ignores the objects, since the dependencies never hold."""
 
     contents = entries = attributes = answer = place = layout = values = kind = _note
 

@@ -156,7 +156,7 @@ def _are_lists(op: str, lists: dict[str, Sequence[Tensor]], name: str, first: Se
 
 
 def _check_lists(op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars: list[tuple[str, Any]]) -> None:
-    """Checks lists of tensors, and tensors [] with their names. Tensors of the list ``read`` need not be contiguous."""
+    """Checks lists of tensors, and scalars (name, tensor []); tensors of the list ``read`` need not be contiguous."""
     tensors = [tensor for tensors in zip(*lists.values()) for tensor in tensors]
     shapes = tuple([getattr(tensor, "shape", ()) for tensor in next(iter(lists.values()))])
     names = tuple([name for name, _ in scalars])
@@ -165,7 +165,7 @@ def _check_lists(op: str, lists: dict[str, Sequence[Tensor]], read: str, scalars
 
 
 def _rules(lists: Sequence[str], read: str, shapes: Sequence[Any], scalars: Sequence[str]) -> list[TensorRule]:
-    """Returns the rules for the tensors of each parameter, one of each list, and for the tensors []."""
+    """Returns the rules of the tensors: for each parameter, one tensor of each list; then the scalars, tensors []."""
     rows = [TensorRule(name[:-1], _DTYPES, tuple(shape), written=name != read) for shape in shapes for name in lists]
     return [*rows, *(TensorRule(name, _DTYPES, ()) for name in scalars)]
 

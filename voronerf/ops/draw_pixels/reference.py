@@ -19,7 +19,7 @@ class _PixelRuns(NamedTuple):
 
 
 class PixelRuns(_PixelRuns):
-    """The pixels to draw from, as ascending runs. This form is compact if most pixels of a row are included.
+    """The pixels to draw from, as ascending runs of consecutive pixels: compact if most pixels of a row are included.
 
     A place is an index into the pixels of all runs, one run after another.
 

@@ -21,7 +21,7 @@ def draw_points(
 ) -> Annotated[Tensor, "float32 [count, 3]"]:
     """Draws points uniformly from a box.
 
-    This equals drawing a random cell of a regular grid of the box, then a random point in it. Points are hashes of the
+    This equals drawing a random voxel of a regular grid in the box, then a random point in it. Points are hashes of the
     seed and of their indices, the same on every backend and on any number of threads. Not differentiable.
 
     Args:

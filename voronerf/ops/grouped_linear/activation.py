@@ -25,7 +25,7 @@ def one_layer(weight: Tensor, bias: Tensor | None, activation: str) -> Program:
     return _one_layer(len(range(o)), len(range(i)), bias is not None, activation)  # plain ints, not symbolic ones
 
 
-@constant_result  # around the cached function, which torch.compile would trace
+@constant_result  # not on the cached function, which torch.compile would trace
 def _one_layer(o: int, i: int, biased: bool, activation: str) -> Program:
     return _one_layer_once(o, i, biased, activation)
 

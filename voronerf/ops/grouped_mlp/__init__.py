@@ -128,7 +128,7 @@ def layered(
     return Network(program, parameters, names=names), inputs
 
 
-@constant_result  # around the cached function, which torch.compile would trace
+@constant_result  # not on the cached function, which torch.compile would trace
 def _named_program(op: str, text: str, *form: Any) -> tuple[Program, Names]:
     return _named_program_once(op, text, *form)
 

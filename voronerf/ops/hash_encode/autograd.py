@@ -73,7 +73,7 @@ class HashDerivatives:
         ctx.save_for_backward(*tensors)
 
     def encode(self, ctx: Any, gradient: Tensor) -> Hashed:
-        """Returns the gradients of positions, table and direction."""
+        """Returns the gradients of ``encode`` with respect to positions, table and direction."""
         arguments = Hashed._make([*ctx.saved_tensors, ctx.grid])
         to_positions, to_table, to_direction, _ = needed_gradients(ctx, arguments[:4])
         gradients = _NONE

@@ -46,17 +46,17 @@ def march_rays(
     contraction: Annotated[Tensor | None, "same [4] or [5, 3]"] = None,
     backend: str = "auto",
 ) -> March:
-    """Samples rays in strata, skips the empty cells of an occupancy grid, and packs the samples for ``composite``.
+    """Samples rays in strata, skips the empty voxels of an occupancy grid, and packs the samples for ``composite``.
 
     Each ray is cut into ``samples`` strata between its near and its far end, with one sample in each, as in
-    ``voronerf.nerf.sampling.stratified_depths``. A sample is kept if its cell of the grid is occupied. Space outside
-    the box is empty. If every cell is occupied, all stratified samples in the box are kept.
+    ``voronerf.nerf.sampling.stratified_depths``. A sample is kept if its voxel of the grid is occupied. Space
+    outside the box is empty. If every voxel is occupied, all stratified samples in the box are kept.
 
     With a ``contraction``, rays and distances are in world space; the grid, its box and the positions are in contracted
     space (Barron et al. 2022, "Mip-NeRF 360", equation 10; or Mildenhall et al. 2020, "NeRF", appendix C).
 
-    To stop at opaque surfaces, march in pieces: limit each call to ``max_samples`` per ray, and pass its ``stop`` as
-    ``start`` to the next call.
+    To stop at opaque surfaces, march in pieces: limit each call to ``max_samples`` per ray, and pass the ``stop`` of
+    its result as ``start`` to the next call.
 
     The number of samples depends on values on the device. Without ``capacity`` the host waits for this number. With
     ``capacity`` the result has that many rows: rows beyond ``ray_offsets[r]`` belong to no ray and are 0, and rays that
@@ -68,7 +68,7 @@ def march_rays(
         directions: the directions of the rays, unit vectors.
         near: the start of the first stratum.
         far: the end of the last stratum; a ray with far <= near has no samples.
-        occupied: whether each cell of the box is occupied; x, y, z >= 1.
+        occupied: whether each voxel of the box is occupied; x, y, z >= 1.
         box: the lowest and the highest corner of the grid.
         samples: the number of strata of a ray, s, 1 to 65,535.
         uniforms: the relative position of each sample in its stratum, 0 to 1; None for the middle.

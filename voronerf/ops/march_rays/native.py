@@ -39,7 +39,7 @@ inputs_of = _OP.inputs(native.compiled.MarchInputs, **INPUTS)
 
 @_OP.custom_op("march_rays_native", fake=fake)
 def march_rays(arguments: Any) -> March:
-    """Samples the strata in occupied cells; see ``voronerf.ops.march_rays``."""
+    """Samples the strata in occupied voxels; see ``voronerf.ops.march_rays``."""
     near, capacity, inputs, machine = (
         arguments.near,
         arguments.capacity,

@@ -1,7 +1,7 @@
 """Ray marching through an occupancy grid. r rays, s strata of a ray, m samples of all rays (packed).
 
-All backends do the same operations in the same order and round each one, so a sample falls in the same cell on all of
-them.
+All backends do the same operations in the same order and round each one, so a sample falls in the same voxel on all
+of them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from voronerf.ops.formulas import depth_of
 
 
 class March(NamedTuple):
-    """The samples of rays in occupied cells, packed.
+    """The samples of rays in occupied voxels, packed.
 
     Attributes:
         ray_offsets: int32 [r + 1]: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
@@ -60,7 +60,7 @@ def fake(arguments: Any) -> March:
 
 @torch.no_grad()
 def march_rays(*arguments: Any) -> March:
-    """Samples each stratum and keeps the samples in occupied cells; see ``voronerf.ops.march_rays``."""
+    """Samples each stratum and keeps the samples in occupied voxels; see ``voronerf.ops.march_rays``."""
     origins, directions, near, far, occupied, box, samples, *options = arguments
     uniforms, seed, spacing, start, max_samples, capacity, contraction = options
     max_samples = samples if max_samples is None else max_samples

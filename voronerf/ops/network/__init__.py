@@ -128,9 +128,9 @@ class Network:
     def fwd(
         self, inputs: Sequence[Tensor], cells: Cells, *, ray_index: Tensor | None = None, backend: str = "auto"
     ) -> tuple[list[Tensor], Tape]:
-        """Evaluates every row as a call does; returns results without an autograd graph, and their tape.
+        """Evaluates every row; returns the results, without an autograd graph, and the tape of their gradients.
 
-        The arguments are the arguments of a call.
+        The arguments are as in :meth:`__call__`.
         """
         self.check(inputs, cells, ray_index)
         learns = torch.is_grad_enabled()
@@ -202,7 +202,7 @@ class Network:
         return next((p.shape[0] for p in self.parameters if p.shape[0] != 1), 1)
 
     def check(self, inputs: Sequence[Tensor], cells: Cells, ray_index: Tensor | None) -> None:
-        """Raises the errors of a call with these arguments; reads values on the CPU alone."""
+        """Raises the errors of a call with these arguments; reads the values of tensors on the CPU only."""
         op, program, parameters, names = self.names.op, self.program, self.given, self.names
         if not program.inputs:
             raise ValueError(f"{op}: program must have at least one input, got none")
@@ -274,7 +274,7 @@ def _rules(
 
 
 class _Graph(NamedTuple):
-    """The graph of autograd, as the tape of an evaluation outside of the compiled module.
+    """An autograd graph, which serves as the tape of an evaluation outside of the compiled module.
 
     Attributes:
         outputs: the results, with gradients.

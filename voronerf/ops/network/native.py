@@ -158,8 +158,8 @@ class _Gradient(NamedTuple):
 
     Attributes:
         text: the text of the gradient's program.
-        places: the index of the tensor whose gradient each result is, among the inputs, then the parameters.
-        keeps: whether it can use the features that the program kept.
+        places: for each result, the index of the tensor whose gradient it is, among the inputs, then the parameters.
+        keeps: whether the gradient can use the grid features that the program kept.
         sifts: whether rows whose arriving gradients are all 0 may be dropped.
     """
 
@@ -184,7 +184,7 @@ def _gradient(text: str, count: int, wanted: tuple[bool, ...], present: tuple[bo
 
 @constant_result
 def _results(text: str) -> int:
-    """Returns the number of outputs and sums; kept features follow them in the list of results."""
+    """Returns the number of outputs and sums of the program ``text``, which precede kept grid features."""
     program = Program.parse(text)
     return len(program.outputs) + len(program.sums)
 
@@ -240,7 +240,7 @@ def _memory(call: Run) -> list[Tensor]:
 def _direct(call: Run, asked: bool) -> list[Tensor] | None:
     """Returns the results of a CPU call, for which the compiled module allocates them; None if Python has to do it.
 
-    ``asked`` refuses calls that modes, transforms or profilers of torch observe.
+    With ``asked``, also returns None for calls that modes, transforms or profilers of torch observe.
     """
     if not compiled_runs(call.text) or native.on_cuda(call.offsets):
         return None

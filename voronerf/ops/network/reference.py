@@ -100,7 +100,7 @@ def _check_rows(program: Program, names: Names, inputs: Sequence[Tensor], index:
 
 
 class Run:
-    """One run of a program and its values. ``inside``: bool [n, 1], whether a row belongs to a cell."""
+    """An evaluation of a program, with its values. ``inside``: bool [n, 1], whether a row belongs to a cell."""
 
     def __init__(
         self,
@@ -236,9 +236,9 @@ def cells_of(offsets: Tensor, rows: Tensor) -> Tensor:
 
 @contextlib.contextmanager
 def recording() -> Iterator[None]:
-    """Enables autograd within a custom op, where PyTorch disables it and gradients would be 0.
+    """Lets autograd record operations within a custom op, where PyTorch disables it and gradients would be 0.
 
-    PyTorch has no public function for this.
+    It has no relation to recorded training steps. PyTorch has no public function for this.
     """
     left_out = torch._C._dispatch_tls_local_exclude_set()
     for key in ("AutogradCPU", "AutogradCUDA", "ADInplaceOrView"):

@@ -14,5 +14,5 @@ observe_occupancy = _OP.compiled_op(
     "observe_occupancy_native",
     "observe_occupancy",
     *(_samples, "density", "occupied"),
-    *(Memory(torch.int32, "m"), Memory(torch.float32, "m")),  # the samples' cells, and the cells' old densities
+    *(Memory(torch.int32, "m"), Memory(torch.float32, "m")),  # the samples' voxels, and the voxels' old densities
 )

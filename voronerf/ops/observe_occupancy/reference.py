@@ -1,4 +1,4 @@
-"""Updating an occupancy grid from rendered samples. x, y, z cells along each axis, m samples."""
+"""Updating an occupancy grid from rendered samples. x, y, z voxels along each axis, m samples."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from voronerf.ops.formulas import voxels_of
 
 @torch.no_grad()
 def observe_occupancy(*arguments: Any) -> None:
-    """Updates the cells of the samples; see ``voronerf.ops.observe_occupancy``."""
+    """Updates the voxels of the samples; see ``voronerf.ops.observe_occupancy``."""
     density, occupied, box, positions, sigma, deltas, weights, decay, threshold, hidden, contraction, fixed = arguments
     observed = sigma.nan_to_num(nan=float("inf"), posinf=float("inf"))
     rows = voxels_of(positions, box, density.shape).long()
     count = density.numel()
-    # Ignored samples go to one additional cell.
+    # Ignored samples go to one additional voxel.
     if fixed is not None:
         rows = torch.where(fixed.reshape(-1)[rows], count, rows)
     if deltas is not None:
@@ -26,7 +26,7 @@ def observe_occupancy(*arguments: Any) -> None:
         rows = torch.where(deltas != 0, rows, count)
         observed = torch.where(lit, observed, 0)
     faded, marked = (torch.nn.functional.pad(table.view(-1), (0, 1)) for table in (density, occupied))
-    # A cell decays once, for any number of samples.
+    # A voxel decays once, for any number of samples.
     faded = faded.scatter(0, rows, faded[rows] * decay)
     if contraction is not None:
         observed = observed * stretch(positions, contraction)

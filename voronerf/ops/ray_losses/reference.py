@@ -50,10 +50,10 @@ def surface(
     """Returns the losses of ``voronerf.ops.surface_loss`` [], differentiable in weights and opacities [m].
 
     Args:
-        weights: zero for samples that are not lit; so are the opacities.
-        opacities: the opacities of the samples.
-        depths: finite.
-        deltas: finite.
+        weights: the weights of the samples, zero if not ``lit``.
+        opacities: the opacities of the samples, zero if not ``lit``.
+        depths: the depths of the samples, finite.
+        deltas: the lengths of the samples, finite.
         spans: the result of `ray_spans`.
         lit: bool [m], whether the samples count.
         near: the near ends of the rays.

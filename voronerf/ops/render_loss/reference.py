@@ -20,7 +20,7 @@ class RenderLoss(NamedTuple):
         colour: [r, 3], background included.
         weights: [m], the rendering weight of each sample.
         density: [m], the density of each sample.
-        error: [r], the squared error of the colour of each ray, summed over the channels; 0 for unseen rays.
+        error: [r], the squared error of the colour of each ray, summed over the channels; 0 for a ray without a target.
         gradient: [m, 4], the gradient of the loss with respect to ``raw``.
 
     Examples:

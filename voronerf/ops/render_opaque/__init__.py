@@ -69,7 +69,7 @@ def render_opaque(
         directions: the directions of the rays, unit vectors; the networks may read them.
         near: the start of the first stratum.
         far: the end of the last stratum; a ray with far <= near has no samples.
-        occupied: whether each cell of the box is occupied.
+        occupied: whether each voxel of the box is occupied.
         box: the lowest and the highest corner of the grid.
         samples: the number of strata of a ray, s; each sample is the middle of its stratum.
         network: the networks. The program's inputs are positions [n, 3] and, if it reads them, directions with one row

@@ -50,7 +50,7 @@ def _interface() -> int | None:
 
 
 def _why_missing(error: ImportError | OSError) -> str:
-    """Returns one line: the folder of these sources, why their compiled module cannot be loaded, and the remedy."""
+    """Returns one line: the package's folder, why its compiled module cannot be loaded, and the remedy."""
     here = Path(__file__).resolve().parents[4]
     others = [place for place in sys.path if Path(place).resolve() != here]  # where a wheel may be installed
     spec = PathFinder.find_spec("_C", [os.path.join(place, "voronerf", "ops", "_core") for place in others])
