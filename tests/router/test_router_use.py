@@ -18,7 +18,7 @@ from torch.utils.checkpoint import checkpoint
 from voronerf import NeRF, VoronoiDiagram
 from voronerf.ops._core.tolerances import FLOOR
 from voronerf.router import VoronoiRouter
-from voronerf.router.optimizers import MOMENTS
+from voronerf.router.optimizers import MOMENTS, steady_part
 
 
 @pytest.fixture
@@ -116,8 +116,11 @@ def test_children_step_as_their_parent_would(generator: torch.Generator, name: s
     other = OPTIMIZERS[name]([{"params": [p]} for p in plain.parameters() if p.requires_grad])
     for a, b in zip(trained, (g["params"][0] for g in other.param_groups), strict=True):
         other.state[b] = copy.deepcopy(optimizer.state[a])
+        steady = steady_part(other.state[b], optimizer.param_groups[0])
         for key in MOMENTS & other.state[b].keys():
             other.state[b][key][0] /= 2
+            if steady is not None and key.endswith("exp_avg_sq"):
+                other.state[b][key][0] *= 1 - steady[0] / 2
     # The new centre is far away: its cell has no samples, and the other cells keep their samples.
     finer, parents = router.diagram.refine({0: torch.cat([router.diagram.centres[:1], torch.full((1, 3), 90.0)])})
     router.subdivide(finer, parents, optimizer=optimizer)
@@ -175,16 +178,21 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
         router.subdivide(router.diagram, optimizer=stranger)
 
 
-def test_children_share_the_moments_of_their_parent(generator: torch.Generator) -> None:
+@pytest.mark.parametrize("mean", [0.0, 0.5, 1.0])
+def test_children_share_the_moments_of_their_parent(generator: torch.Generator, mean: float) -> None:
+    """A third of the samples has a third of the mean gradient and of the variance, and a ninth of the mean's square."""
     router = router_of(nn.Linear(3, 2), generator, k=2)
     optimizer = torch.optim.Adam(router.parameters())
     router(uniform(generator, 90, 3)).square().sum().backward()
     optimizer.step()
+    for state in optimizer.state.values():
+        state["exp_avg"] *= mean  # relative to the root mean square
     before = [{key: value.clone() for key, value in state.items()} for state in optimizer.state.values()]
     router.subdivide(3, points=uniform(generator, 90, 3), cells=[1], optimizer=optimizer)
     for old, state in zip(before, optimizer.state.values(), strict=True):
-        for key in ("exp_avg", "exp_avg_sq"):  # squares, too: a third of the samples has a third of the variance
-            torch.testing.assert_close(state[key], torch.stack([old[key][0], *[old[key][1] / 3] * 3]))
+        for key, part in {"exp_avg": 1 / 3, "exp_avg_sq": mean**2 / 9 + (1 - mean**2) / 3}.items():
+            expected = torch.stack([old[key][0], *[old[key][1] * part] * 3])
+            torch.testing.assert_close(state[key], expected, rtol=1e-4, atol=0)
         assert state["step"] == old["step"]
 
 

@@ -34,8 +34,9 @@ def move_state(
     """Gives every new cell its parent's optimiser state.
 
     The n children of a cell share its samples: the mean of their gradients is about 1/n of the parent's, and so is the
-    variance. Moments of gradients and of squares are therefore divided by n. Otherwise Adam would make up to n times
-    shorter steps until it has forgotten the parent's gradients, for a thousand steps with beta2 = 0.999.
+    variance, but the square of the mean is 1/n^2. Moments are therefore divided by n, and the part of Adam's mean
+    squares that is the square of the mean by n^2. Otherwise Adam would make up to n times shorter steps until it has
+    forgotten the parent's gradients, for a thousand steps with beta2 = 0.999.
 
     The parameters have their new shapes already. If any state tensor does not have one row per cell, all state is
     reset.
@@ -48,14 +49,19 @@ def move_state(
         shares: The number n of cells that share the samples of each new cell's parent, int64 [new cells].
         fresh: The mask of new cells whose state becomes 0, bool [new cells]; None for no cells.
     """
-    is_reset = False
+    is_reset, groups = False, {id(p): group for group in optimizer.param_groups for p in group["params"]}
     for parameter in cell_parameters(module):
         state = optimizer.state.get(parameter, {})
+        steady = steady_part(state, groups.get(id(parameter), {}))
         for key, value in state.items():
             if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
-                state[key] = value[parents.to(value.device)]
+                rows = parents.to(value.device)
+                state[key] = value[rows]
                 if key in MOMENTS:
-                    state[key] /= shares.to(value).view(-1, *[1] * (value.dim() - 1))
+                    n = shares.to(value).view(-1, *[1] * (value.dim() - 1))
+                    state[key] /= n
+                    if steady is not None and key.endswith("exp_avg_sq"):
+                        state[key] *= 1 - steady[rows] * (1 - 1 / n)
                 if fresh is not None:
                     state[key][fresh.to(value.device)] = 0
             else:
@@ -66,6 +72,15 @@ def move_state(
             f"{_OP}.subdivide: the state of {type(optimizer).__name__} cannot be inherited by cells and is reset",
             stacklevel=4,
         )
+
+
+def steady_part(state: dict[str, Any], group: dict[str, Any]) -> Tensor | None:
+    """Returns which part of Adam's mean squares is the square of the mean, 0 to 1; None for other optimisers."""
+    if "betas" not in group or not {"exp_avg", "exp_avg_sq", "step"} <= state.keys():
+        return None
+    bias1, bias2 = (1 - beta ** state["step"] for beta in group["betas"])
+    part = (state["exp_avg"] / bias1).square() / (state["exp_avg_sq"] / bias2)
+    return part.nan_to_num(0.0).clamp(max=1)
 
 
 def drop_state(optimizer: torch.optim.Optimizer) -> None:
