@@ -1,5 +1,7 @@
 """Times one network per label on one thread, computed by a router, by ``vmap``, by ``baddbmm``, and by a loop.
 
+Beside them stands one network that gets all rows, in a router of one cell.
+
 Also compares optimisers for many labels of which a batch holds few.
 
     python benchmarks/groups.py --json benchmarks/results/groups.json
@@ -78,10 +80,14 @@ class Siren(nn.Module):
 
 
 def ways(k: int) -> dict[str, tuple[Parameters, Run]]:
-    """Returns {method: (parameters, function [k, rows, 2] -> [k, rows, 3])}; all methods have the same k networks."""
+    """Returns {method: (parameters, function [k, rows, 2] -> [k, rows, 3])}.
+
+    All methods have the same k networks, except "one", which has the first of them.
+    """
     modules = [Siren() for _ in range(k)]
     router = VoronoiRouter.from_modules(modules, fuse=True)
     labels = torch.arange(k)[:, None]
+    one = VoronoiRouter(modules[0], torch.zeros(1, 2), coords="first2", fuse=True)
 
     stacked = {name: nn.Parameter(value.detach()) for name, value in stack_module_state(modules)[0].items()}
     mapped = vmap(lambda parameters, x: functional_call(modules[0], parameters, (x,)))
@@ -101,6 +107,7 @@ def ways(k: int) -> dict[str, tuple[Parameters, Run]]:
 
     return {
         "router": (list(router.parameters()), lambda x: router(x, cells=labels.expand(k, x.shape[1]))),
+        "one": (list(one.parameters()), one),
         "vmap": (list(stacked.values()), lambda x: mapped(stacked, x)),
         "baddbmm": ([*weights, *biases], by_hand),
         "loop": ([p for module in modules for p in module.parameters()], loop),
@@ -150,8 +157,9 @@ def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> di
     """Measures k networks with ``rows`` rows each: calls, or steps with Adam if ``images`` are given."""
     contenders, x = ways(k), torch.rand(k, rows, 2) * 2 - 1
     expected = contenders["loop"][1](x)
-    for _, run in contenders.values():
-        torch.testing.assert_close(run(x), expected, atol=1e-4, rtol=1e-4)
+    for name, (_, run) in contenders.items():
+        if name != "one":
+            torch.testing.assert_close(run(x), expected, atol=1e-4, rtol=1e-4)
     runs = {
         name: call(run, parameters, x) if images is None else step(run, parameters, images)
         for name, (parameters, run) in contenders.items()
@@ -160,7 +168,7 @@ def row(options: Options, k: int, rows: int, images: Tensor | None = None) -> di
         once(0)
     timings = measure(runs, dict.fromkeys(runs, options.seconds), Stopwatch(torch.device("cpu"), time.process_time))
     result: dict[str, Any] = {f"{name}_ms": round(timing.median_ms, 2) for name, timing in timings.items()}
-    best = min(timing.median_ms for name, timing in timings.items() if name != "router")
+    best = min(timing.median_ms for name, timing in timings.items() if name not in ("router", "one"))
     result |= {"times_as_fast": round(best / timings["router"].median_ms, 2)}
     if images is not None:
         for number in range(options.steps):
