@@ -155,6 +155,19 @@ def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> N
     assert any(not torch.equal(a, b) for a, b in zip(before, router.parameters(), strict=True))
 
 
+def test_factored_squares_are_reset(generator: torch.Generator) -> None:
+    """Optimisers such as Adam-mini keep one mean square for a block of a parameter."""
+    router = router_of(nn.Linear(3, 2), generator, k=2)
+    optimizer = torch.optim.Adam(router.parameters())
+    router(uniform(generator, 90, 3)).square().sum().backward()
+    optimizer.step()
+    for state in optimizer.state.values():
+        state["exp_avg_sq"] = state["exp_avg_sq"].flatten(1).mean(1)
+    with pytest.warns(UserWarning, match="state of Adam cannot be inherited"):
+        router.subdivide(3, points=uniform(generator, 90, 3), optimizer=optimizer)
+    assert not optimizer.state
+
+
 def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     router = router_of(LearnedSine(), generator, k=1)
     x = uniform(generator, 90, 3)

@@ -76,11 +76,11 @@ def move_state(
 
 def steady_part(state: dict[str, Any], group: dict[str, Any]) -> Tensor | None:
     """Returns which part of Adam's mean squares is the square of the mean, 0 to 1; None for other optimisers."""
-    if "betas" not in group or not {"exp_avg", "exp_avg_sq", "step"} <= state.keys():
+    mean, squares, step = (state.get(key) for key in ("exp_avg", "exp_avg_sq", "step"))
+    if "betas" not in group or mean is None or squares is None or step is None or mean.shape != squares.shape:
         return None
-    bias1, bias2 = (1 - beta ** state["step"] for beta in group["betas"])
-    part = (state["exp_avg"] / bias1).square() / (state["exp_avg_sq"] / bias2)
-    return part.nan_to_num(0.0).clamp(max=1)
+    bias1, bias2 = (1 - beta**step for beta in group["betas"])
+    return ((mean / bias1).square() / (squares / bias2)).nan_to_num(0.0).clamp(max=1)
 
 
 def drop_state(optimizer: torch.optim.Optimizer) -> None:
