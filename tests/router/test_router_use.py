@@ -155,6 +155,17 @@ def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> N
     assert any(not torch.equal(a, b) for a, b in zip(before, router.parameters(), strict=True))
 
 
+def test_moments_that_are_soon_forgotten_stay_whole(generator: torch.Generator) -> None:
+    router = router_of(nn.Linear(3, 2), generator, k=1)
+    optimizer = torch.optim.Adam(router.parameters(), betas=(0.9, 0.99))
+    router(uniform(generator, 90, 3)).square().sum().backward()
+    optimizer.step()
+    before = [state["exp_avg_sq"].clone() for state in optimizer.state.values()]
+    router.subdivide(3, points=uniform(generator, 90, 3), optimizer=optimizer)
+    for old, state in zip(before, optimizer.state.values(), strict=True):
+        assert torch.equal(state["exp_avg_sq"], old.expand(3, *old.shape[1:]))
+
+
 def test_factored_squares_are_reset(generator: torch.Generator) -> None:
     """Optimisers such as Adam-mini keep one mean square for a block of a parameter."""
     router = router_of(nn.Linear(3, 2), generator, k=2)

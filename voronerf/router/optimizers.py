@@ -36,7 +36,8 @@ def move_state(
     The n children of a cell share its samples: the mean of their gradients is about 1/n of the parent's, and so is the
     variance, but the square of the mean is 1/n^2. Moments are therefore divided by n, and the part of Adam's mean
     squares that is the square of the mean by n^2. Otherwise Adam would make up to n times shorter steps until it has
-    forgotten the parent's gradients, for a thousand steps with beta2 = 0.999.
+    forgotten the parent's gradients, for a thousand steps with beta2 = 0.999. With beta2 up to 0.99 it forgets them
+    soon enough, and moments stay whole: shorter first steps gain 0.3 and 0.6 dB (Lego, 64 cells).
 
     The parameters have their new shapes already. If any state tensor does not have one row per cell, all state is
     reset.
@@ -52,12 +53,13 @@ def move_state(
     is_reset, groups = False, {id(p): group for group in optimizer.param_groups for p in group["params"]}
     for parameter in cell_parameters(module):
         state = optimizer.state.get(parameter, {})
-        steady = steady_part(state, groups.get(id(parameter), {}))
+        group = groups.get(id(parameter), {})
+        steady, forgets = steady_part(state, group), "betas" in group and group["betas"][1] <= 0.99
         for key, value in state.items():
             if isinstance(value, Tensor) and value.shape == (k, *parameter.shape[1:]):
                 rows = parents.to(value.device)
                 state[key] = value[rows]
-                if key in MOMENTS:
+                if key in MOMENTS and not forgets:
                     n = shares.to(value).view(-1, *[1] * (value.dim() - 1))
                     state[key] /= n
                     if steady is not None and key.endswith("exp_avg_sq"):

@@ -415,10 +415,10 @@ class VoronoiRouter(nn.Module):
         """Replaces the diagram by a finer one; every new cell starts as a copy of its parent.
 
         Parameters are copied from the parent. With ``optimizer``, the state of Adam, AdamW, RAdam, SGD and similar
-        optimisers is copied too, and moments are divided by the number of children, which share the parent's samples.
-        The state of other optimisers is reset, with a warning. The parameter objects stay the same, so groups, learning
-        rates and schedules continue. A wrapper with parameters of its own, such as ``DistributedDataParallel``, must be
-        made again.
+        optimisers is copied too. Moments are divided by the number of children, which share the parent's samples, but
+        not if Adam soon forgets them (``betas[1]`` up to 0.99). The state of other optimisers is reset, with a warning.
+        The parameter objects stay the same, so groups, learning rates and schedules continue. A wrapper with parameters
+        of its own, such as ``DistributedDataParallel``, must be made again.
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
