@@ -153,7 +153,7 @@ class SparseDepth:
 
 @replayed
 class SmoothDepth:
-    """A loss on depths that are not locally planar, for triples of neighbouring rays that no training pixel shows.
+    """A loss on non-planar depths, for triples of neighbouring rays from positions without a camera.
 
     The triples are the last rays of a batch (``Batch.unseen``). See `voronerf.ops.smooth_depth_loss`.
 

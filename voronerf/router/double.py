@@ -23,7 +23,7 @@ from voronerf.router.layout import Call, map_tree, reachable
 
 _OP = "VoronoiRouter"
 _PLAIN = {type(None), bool, int, float, str, type, torch.dtype, torch.device, torch.Size, types.FunctionType, Tensor}
-_LAYERS = "torch.nn.modules."  # modules from this package assign no attributes in ``forward``
+_LAYERS = "torch.nn.modules."  # its modules, except RNNs, assign no attributes in ``forward``
 _REGISTRIES, _OF_HOOKS = ("_parameters", "_buffers", "_modules"), (OrderedDict, dict, set)
 _SEARCHED = 1000  # maximum number of searched objects in an attribute that is not one of HOLDERS
 

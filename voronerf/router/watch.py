@@ -39,7 +39,7 @@ class Inputs:
 
     sources: frozenset[Source] = frozenset()
     dtype: torch.dtype = torch.float64  # dtype of numbers as tensors, one of NUMBERS
-    others: tuple[tuple[Source, Any], ...] = ()  # earlier values of sources, for which the trace must hold, too
+    others: tuple[tuple[Source, Any], ...] = ()  # old values of sources; the trace must hold for them too
 
     def tensor(self, value: Any, device: torch.device) -> Tensor:
         """Returns a number as a tensor, and a tensor unchanged."""

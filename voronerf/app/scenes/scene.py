@@ -175,7 +175,7 @@ class Scene:
         times finer. This would cost table entries, although the images have no finer details there.
 
         Raises:
-            SceneError: For a scene without a box that is not contracted.
+            SceneError: If there is neither a box nor a contraction.
         """
         if space.contraction is not None:
             box = space.contraction.cube

@@ -85,7 +85,7 @@ class Keyframes:
         client.change()
 
     def frames(self) -> CameraPath:
-        """Returns the smooth path, with frames of the sharp picture's size."""
+        """Returns the smooth path, with frames of the last keyframe's size."""
         keyframes, closed = same_size(self.cameras), bool(self.closed.value)
         count = round(chosen(self.seconds) * FPS)
         return CameraPath(smooth_path(keyframes, count, closed=closed), FPS, keyframes, closed)
