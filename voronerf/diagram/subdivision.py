@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from voronerf.diagram.balance import CENTRES, Balance, balance, cell_weights, check_samples
+from voronerf.diagram.balance import CENTRES, Balance, balance, cell_weights, check_samples, first_distinct
 from voronerf.diagram.voronoi import VoronoiDiagram
 
 
@@ -106,10 +106,9 @@ def split_diagram(
             "more cells than samples"
         )
     leaves = diagram.locate(points.to(diagram.centres.device), backend=backend).cpu()
-    distinct = torch.unique(torch.cat([leaves[:, None].to(points.dtype), points], 1), dim=0)
-    counts = torch.bincount(distinct[:, 0].long(), minlength=diagram.num_cells).tolist()
-
-    chosen = [cell for cell in _cell_numbers(cells, diagram.num_cells) if counts[cell] >= max(k, min_samples)]
+    least = max(k, min_samples)
+    numbers = _cell_numbers(cells, diagram.num_cells)
+    chosen = [cell for cell in numbers if len(first_distinct(points[leaves == cell], least)) == least]
     if cells == "worst" and chosen:
         accumulated = cell_weights(leaves, importance, diagram.num_cells)
         chosen = [max(chosen, key=lambda cell: float(accumulated[cell]))]
