@@ -1,11 +1,10 @@
-"""Times small calls of ops, and routers compared with a single network, in turns on one thread.
+"""Times a small call of an op, and routers compared with a single network, in turns on one thread.
 
     python benchmarks/calls.py --json benchmarks/results/calls.json
 
-Ops: the public Python function and, for ``nearest_centre``, the C++ function that it calls. Routers: 16 cells with
+The op is ``nearest_centre``: the public Python function, and the C++ function that it calls. Routers: 16 cells with
 ``fuse=True``, compared with one such cell, one ``nn.Sequential`` and routing by hand (argmin, argsort, one padded
-``baddbmm`` per layer, scatter). Networks on sorted rows: ``grouped_mlp``, compared with a padded ``baddbmm``. Times are
-median wall times in microseconds.
+``baddbmm`` per layer, scatter). Times are median wall times in microseconds.
 """
 
 from __future__ import annotations
@@ -18,12 +17,10 @@ from typing import Any
 
 import torch
 import tyro
-from harness import Stopwatch, measure, metadata, threads
+from harness import Stopwatch, measure, threads, write_results
 from torch import Tensor, nn
 
-from voronerf import MLP, Layer, VoronoiRouter, grouped_mlp, nearest_centre
-from voronerf.app.files import json_text, write_text
-from voronerf.ops import rendered_gradient
+from voronerf import VoronoiRouter, nearest_centre
 from voronerf.ops._core import native
 
 CELLS, WIDTH = 16, 64
@@ -44,23 +41,21 @@ def network() -> nn.Sequential:
     return nn.Sequential(nn.Linear(3, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 4))
 
 
-def padded(x: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Applies layers of weights [k, i, o] and biases [k, 1, o] to rows [k, n, i], with ReLU between the layers."""
-    for place, (weight, bias) in enumerate(layers):
-        x = torch.baddbmm(bias, x, weight)
-        if place < len(layers) - 1:
-            x = x.relu()
-    return x
-
-
 def by_hand(x: Tensor, centres: Tensor, layers: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """Routes rows with plain torch operations, as a user without the library would."""
+    """Routes rows with plain torch operations, as a user without the library would.
+
+    The layers have weights [k, i, o] and biases [k, 1, o].
+    """
     cells = torch.cdist(x, centres).argmin(1)
     order = cells.argsort()
     counts = cells.bincount(minlength=len(centres))
     rows = torch.arange(len(x)) - (counts.cumsum(0) - counts)[cells[order]]
-    table = x.new_zeros(len(centres), int(counts.max()), 3)
-    out = padded(table.index_put((cells[order], rows), x[order]), layers)[cells[order], rows]
+    table = x.new_zeros(len(centres), int(counts.max()), 3).index_put((cells[order], rows), x[order])
+    for place, (weight, bias) in enumerate(layers):
+        table = torch.baddbmm(bias, table, weight)
+        if place < len(layers) - 1:
+            table = table.relu()
+    out = table[cells[order], rows]
     return torch.zeros_like(out).index_put((order,), out)
 
 
@@ -71,11 +66,6 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
     contenders["nearest_centre, 8 points"] = {
         "public": lambda _: nearest_centre(points, centres),
         "compiled": lambda _: native.compiled.nearest_centre(points, centres, None, cells, 8, 4, 3, 0, cpu),
-    }
-    raw, of_depth, offsets = torch.rand(2, 2, 4), torch.ones(1), torch.tensor([0, 2], dtype=torch.int32)
-    along = torch.tensor([6.9, 1e3]), torch.tensor([1.0, 2]), torch.full((2,), 0.1), torch.full((2,), 0.5)
-    contenders["rendered_gradient, 8 tensors"] = {
-        "public": lambda _: rendered_gradient(*raw, *along, offsets, of_depth=of_depth, activated=True)
     }
     for n in (16, 256, 4096, 65536):
         plain, x = network(), torch.rand(n, 3)
@@ -97,15 +87,6 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
         contenders[f"{n} rows, with backward"] = {
             name: lambda _, way=way: way().sum().backward() for name, way in ways.items()
         }
-    table = MLP((Layer(("positions",), WIDTH, "relu"), Layer((0,), WIDTH, "relu"), Layer((1,), 4)), outputs=(2,))
-    weights = [torch.randn(CELLS, o, i) / 5 for o, i in table.weight_shapes(3)]
-    biases: list[Tensor | None] = [torch.zeros(CELLS, layer.width) for layer in table.layers]
-    x, ends = torch.rand(1024, 3), torch.arange(0, 1025, 64, dtype=torch.int32)
-    turned = [(w.mT.contiguous(), b[:, None]) for w, b in zip(weights, biases) if b is not None]
-    contenders["1,024 sorted rows"] = {
-        "grouped_mlp": lambda _: grouped_mlp(x, ends, weights, biases, layers=table),
-        "baddbmm": lambda _: padded(x.view(CELLS, 64, 3), turned),
-    }
     return contenders
 
 
@@ -122,8 +103,7 @@ def main(options: Options) -> None:
             microseconds = {name: round(timing.median_ms * 1e3, 2) for name, timing in timings.items()}
             results.append({"row": row, "microseconds": microseconds})
             print(f"{row:34s}" + "   ".join(f"{name} {us:.1f} us" for name, us in microseconds.items()), flush=True)
-        if options.json is not None:
-            write_text(options.json, json_text(metadata(benchmark="calls", results=results)))
+        write_results(options.json, results, benchmark="calls")
 
 
 if __name__ == "__main__":

@@ -34,14 +34,17 @@ from typing import Any
 import torch
 import torch.distributed as dist
 import tyro
-from harness import metadata
+from harness import write_results
 from torch import Tensor
 
 from voronerf.app.evaluate import evaluate, mean_scores
-from voronerf.app.files import json_text, read_json_lines, write_text
+from voronerf.app.files import json_text, read_json_lines
 from voronerf.app.scenes import load_scene
 from voronerf.app.train import TrainConfig, build, train
 from voronerf.nerf import Ranks
+
+LAUNCH = [sys.executable, *shlex.split("-m torch.distributed.run --standalone --nproc-per-node 2")]
+"""The first words of a command that runs in two processes."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +102,8 @@ def work(options: Options, seed: int) -> None:
     config = TrainConfig(data=options.data[0], steps=options.steps, rays=rays, seed=seed)
     state = build(config, scene, ranks=ranks)
     train(state)
-    result: dict[str, Any] = {
-        "scene": scene.name,
-        "processes": ranks.size,
-        "threads": torch.get_num_threads(),
-        "seed": seed,
-    }
-    result |= {"steps": state.step, "rays": rays, "step_ms": 1e3 * state.seconds / state.step}
+    result: dict[str, Any] = {"scene": scene.name, "processes": ranks.size, "threads": torch.get_num_threads()}
+    result |= {"seed": seed, "steps": state.step, "rays": rays, "step_ms": 1e3 * state.seconds / state.step}
     if ranks.size > 1:
         sizes = ranks.sizes[-1]
         tensors, alone = [torch.zeros(size) for size in sizes], []
@@ -131,9 +129,8 @@ def work(options: Options, seed: int) -> None:
 def in_turns(options: Options) -> list[dict[str, Any]]:
     """Trains in two processes, in one of two threads, and in one of one thread, in turns."""
     results = []
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     for data, seed in itertools.product(options.data, options.seeds):
-        for prefix, threads in ((launch, 1), ([sys.executable], 2), ([sys.executable], 1)):
+        for prefix, threads in ((LAUNCH, 1), ([sys.executable], 2), ([sys.executable], 1)):
             words = [__file__, "--worker", seed, *_scene_words(options, data)]
             words += ["--steps", options.steps, "--rays", options.rays]
             environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
@@ -150,22 +147,11 @@ def killed(options: Options) -> dict[str, Any]:
     choose = random.Random(options.seeds[0])
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        words = [
-            *shlex.split("-m torch.distributed.run --standalone --nproc-per-node 2 --max-restarts"),
-            options.kills + 1,
-        ]
-        words += [*shlex.split("-m voronerf train --resume --checkpoint-every 1 --panels 0 --eval-views 1")]
-        words += [
-            *_scene_words(options, options.data[0]),
-            "--steps",
-            options.steps,
-            "--rays",
-            options.rays,
-            "--out",
-            out,
-        ]
+        words = [*LAUNCH, "--max-restarts", options.kills + 1, "-m", "voronerf", "train", "--out", out]
+        words += shlex.split("--resume --checkpoint-every 1 --panels 0 --eval-views 1")
+        words += [*_scene_words(options, options.data[0]), "--steps", options.steps, "--rays", options.rays]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, *map(str, words)]
+        command = [*map(str, words)]
         process = subprocess.Popen(
             command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -252,9 +238,7 @@ def main(options: Options) -> None:
         print(json_text(results[0]))
     else:
         results = in_regions(options) if options.regions else in_turns(options)
-    if options.json is not None:
-        stored = {"metadata": metadata(benchmark="distributed"), "results": results}
-        write_text(options.json, json_text(stored, indent=1) + "\n")
+    write_results(options.json, results, benchmark="distributed")
     return None
 
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness import Parser, metadata
+from harness import Parser, write_results
 from ops.foreign_imports import repository
 from ops.foreign_kinds import KINDS
 from ops.foreign_public import PUBLIC
@@ -95,18 +95,18 @@ def main(arguments: list[str] | None = None) -> None:
         results.append(row)
         print(json.dumps(row), flush=True)
     print(counts(results))
-    if options.json:
-        head = metadata(
-            benchmark="modules of public repositories in VoronoiRouter(fuse=True)",
-            samples=N,
-            sizes=[SIZES.start, SIZES.stop - 1],
-            cells=K,
-            seed=SEED,
-            compared=" ".join(COMPARED.split()),
-            **{"stand-ins": STAND_INS},
-            **counts(results),
-        )
-        options.json.write_text(json.dumps({"metadata": head, "results": results}, indent=1) + "\n")
+    write_results(
+        options.json,
+        results,
+        benchmark="modules of public repositories in VoronoiRouter(fuse=True)",
+        samples=N,
+        sizes=[SIZES.start, SIZES.stop - 1],
+        cells=K,
+        seed=SEED,
+        compared=" ".join(COMPARED.split()),
+        **{"stand-ins": STAND_INS},
+        **counts(results),
+    )
 
 
 if __name__ == "__main__":

@@ -29,12 +29,11 @@ from typing import Any
 
 import torch
 import tyro
-from harness import Stopwatch, measure, metadata, threads
+from harness import Stopwatch, measure, threads, write_results
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from voronerf import VoronoiRouter
-from voronerf.app.files import json_text, write_text
 from voronerf.nerf import Adam
 
 SIZES = ((64, 8), (64, 1024), (1024, 64), (1024, 256), (4096, 16))
@@ -270,8 +269,7 @@ def main(options: Options) -> None:
         for result in optimizers(options):
             results.append(result)
             print(result, flush=True)
-        if options.json is not None:
-            write_text(options.json, json_text(metadata(benchmark="groups", results=results)))
+        write_results(options.json, results, benchmark="groups")
 
 
 if __name__ == "__main__":

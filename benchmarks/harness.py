@@ -24,6 +24,7 @@ import torch
 
 from voronerf import __version__
 from voronerf.app.cli import keep_freed_memory
+from voronerf.app.files import json_text, write_text
 from voronerf.ops._core import backends
 
 keep_freed_memory()  # benchmarks are programs, as the command line is
@@ -87,6 +88,12 @@ def metadata(**extra: Any) -> dict[str, Any]:
         "machine": processor(),
         "native": backends.describe()["native"],
     }
+
+
+def write_results(path: Path | None, results: Any, **extra: Any) -> None:
+    """Writes {metadata, results} as JSON, with the benchmark's entries in the metadata; None: writes nothing."""
+    if path is not None:
+        write_text(path, json_text({"metadata": metadata(**extra), "results": results}, indent=1) + "\n")
 
 
 class Parser(argparse.ArgumentParser):

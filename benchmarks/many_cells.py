@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Parser, metadata, threads
+from harness import Parser, threads, write_results
 
 from voronerf import OccupancyGrid, VoronoiDiagram, VoronoiRouter
 from voronerf.app.evaluate import evaluate, mean_scores
-from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.nerf import Adam, Occupancy, RayBatches, RayLoss, Renderer, TrainingStep
 from voronerf.nerf.fields import FIELDS
@@ -105,10 +104,8 @@ def main(arguments: list[str] | None = None) -> None:
             results.append(result := measure(scene, cells, options))
         row = f"{result['psnr']:.2f} | {result['steps']} | {result['ms']:.1f} | {result['samples']:,.0f}"
         print(f"| {result['cells']:,} | {row} | {result['us_a_sample']:.2f} |", flush=True)
-    if options.json is not None:
-        asked = {name: value for name, value in vars(options).items() if name != "json"}
-        about = metadata(command="python benchmarks/many_cells.py", benchmark="many_cells", seed=0, **asked)
-        write_text(options.json, json.dumps({"metadata": about, "results": results}, indent=2) + "\n")
+    asked = {name: value for name, value in vars(options).items() if name != "json"}
+    write_results(options.json, results, benchmark="many_cells", seed=0, **asked)
 
 
 if __name__ == "__main__":

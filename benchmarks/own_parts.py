@@ -8,7 +8,6 @@ in turns, with 512 or 2,048 rays a step. Ratios to the default step are medians 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -19,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Parser, metadata, threads
+from harness import Parser, threads, write_results
 
-from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene
 from voronerf.app.train import Callback, State, TrainConfig, build, train
 from voronerf.nerf.schedule import GROUP
@@ -145,7 +143,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="the folder of the scenes")
     parser.add_argument("--turns", type=int, default=24, help="turns of each training")
     parser.add_argument("--json", type=Path, metavar="FILE", help="a JSON file for the results")
-    options: argparse.Namespace = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     data = str(options.data / "lego")
     scene, results = load_scene(data, downscale=4), []
     for count in (1, 2):
@@ -153,16 +151,12 @@ def main(arguments: list[str] | None = None) -> None:
             with threads(count):
                 results.append({"threads": count, **measure(scene, data, rays, options.turns)})
             print(json.dumps(results[-1], indent=2), flush=True)
-    columns = [
-        f"{result['threads']} thread{'s' * (result['threads'] > 1)}, {result['rays']:,} rays" for result in results
-    ]
+    columns = [f"threads: {result['threads']}, rays: {result['rays']:,}" for result in results]
     print(f"| x of the step as it stands | {' | '.join(columns)} |")
     for name in WAYS:
         print(f"| {name} | {' | '.join(format(result['x'][name], '.2f') for result in results)} |")
-    if options.json is not None:
-        waiting = {name: os.environ.get(name) for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
-        about = metadata(command="python benchmarks/own_parts.py --data DATA", benchmark="own_parts", seed=0, **waiting)
-        write_text(options.json, json.dumps({"metadata": about, "results": results}, indent=2) + "\n")
+    waiting = {name: os.environ.get(name) for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")}
+    write_results(options.json, results, benchmark="own_parts", seed=0, **waiting)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from ops.cases_sampling import harmonics_by_value
 from torch import Tensor, nn
 
 from voronerf.app.evaluate.metrics import psnr, ssim
@@ -166,24 +167,6 @@ def _linear(inputs: int, outputs: int) -> nn.Linear:
     return layer
 
 
-def spherical_harmonics(directions: Tensor) -> Tensor:
-    """Returns the first four bands [r, 16] of unit directions [r, 3]."""
-    x, y, z = directions.unbind(-1)
-    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-    return torch.stack(
-        (
-            torch.full_like(x, 0.28209479177387814),
-            *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
-            *(1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.9461746957575601 * zz - 0.31539156525251999),
-            *(-1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy), 0.5900435899266435 * y * (yy - 3 * xx)),
-            *(2.890611442640554 * xy * z, 0.4570457994644658 * y * (1 - 5 * zz), 0.3731763325901154 * z * (5 * zz - 3)),
-            *(0.4570457994644658 * x * (1 - 5 * zz), 1.445305721320277 * z * (xx - yy)),
-            0.5900435899266435 * x * (3 * yy - xx),
-        ),
-        -1,
-    )
-
-
 class Rival:
     """A training of the rival on a scene, which runs in turns and is evaluated like a ``turns.Training``.
 
@@ -288,7 +271,7 @@ class Rival:
         positions = torch.addcmul(origins[ray], directions[ray], depths.view(-1)[kept][:, None])
         if self.contraction is not None:
             positions = (self.contraction.points(positions) - self.low) / self.size
-        colour, density = self.field(positions.clamp_(0, 1), spherical_harmonics(rays.directions), ray)
+        colour, density = self.field(positions.clamp_(0, 1), harmonics_by_value(rays.directions), ray)
         # Rays are padded to all strata, so that one cumsum per ray suffices and rounding errors do not cross rays.
         flat = torch.zeros(depths.numel()).scatter(0, kept, density * deltas.reshape(-1)[kept])
         thickness = flat.view(-1, s)

@@ -16,7 +16,6 @@ import argparse
 import colorsys
 import math
 import random
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -143,17 +142,9 @@ def look(
 
 def write_room(folder: Path, seed: int, *, views: int = 72, width: int = 200, height: int = 150) -> None:
     """Writes the capture of a room: images, a COLMAP model, and the distances in held-out views."""
-    draw = random.Random(seed)
+    draw, noise = random.Random(seed), np.random.default_rng(seed)
     solids, mirrors = room(draw)
-    write_capture(folder, solids, mirrors, path(draw, views, width, height), seed)
-
-
-def write_capture(
-    folder: Path, solids: list[Solid], mirrors: int, cameras: Cameras, seed: int, sky: Sequence[float] = (0, 0, 0)
-) -> None:
-    """Writes the capture of solids below a sky; the first ``mirrors`` solids are mirrors. See `write_room`."""
-    noise, caster = np.random.default_rng(seed), Caster(solids, LIGHT)
-    views, width, height = len(cameras), cameras.width, cameras.height
+    caster, cameras = Caster(solids, LIGHT), path(draw, views, width, height)
     (folder / "images").mkdir(parents=True, exist_ok=True)
     (folder / "sparse/0").mkdir(parents=True, exist_ok=True)
     fine = Cameras(cameras.poses, cameras.intrinsics * FINE, width * FINE, height * FINE)
@@ -161,7 +152,7 @@ def write_capture(
     for view in range(views):
         origins, directions, depth, number = meet(caster, fine, view)
         colour = look(caster, mirrors, origins, directions, depth, number)
-        colour[np.isinf(depth)] = sky
+        colour[np.isinf(depth)] = 0
         pixels = colour.reshape(height, FINE, width, FINE, 3).mean((1, 3)) + noise.normal(0, NOISE, (height, width, 3))
         Image.fromarray(np.rint(255 * pixels.clip(0, 1)).astype(np.uint8)).save(folder / f"images/{view:03d}.png")
         origins, directions, depth, _ = meet(caster, cameras, view)

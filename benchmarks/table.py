@@ -96,8 +96,8 @@ def foreign_markdown(rows: list[Row]) -> list[str]:
     for row in rows:
         times = row["alternatives"]
         masks = times["masks"]
-        name = row["case"].split(" n=")[0] + (f", {row['threads']} threads" if row["threads"] > 1 else "")
-        cells = [name, f"{row['n']:,}", str(row["k"]), row["direction"].replace("+", " + "), milliseconds(masks)]
+        name, direction = row["case"].split(" n=")[0], row["direction"].replace("+", " + ")
+        cells = [name, f"{row['n']:,}", str(row["k"]), direction, milliseconds(masks)]
         cells += [f"**{masks / row['median_ms']:.2f}**"]
         cells += ["-" if times.get(way) is None else f"{masks / times[way]:.2f}" for way in ways]
         lines.append(f"| {' | '.join(cells)} |")

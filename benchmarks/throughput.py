@@ -16,7 +16,6 @@ import argparse
 import atexit
 import functools
 import importlib.metadata
-import json
 import os
 import re
 import shutil
@@ -30,19 +29,12 @@ from typing import Any, NoReturn
 # oneDNN caches compiled products by shape; its default capacity of 1,024 is too small for a loop over many cells.
 os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
+import harness
 import torch
-from harness import Others, Parser, Peaks, Stopwatch, Timing, instruction_set, measure, metadata, processor, threads
-from ops import cases_any as cases_any
-from ops import cases_foreign as cases_foreign
-from ops import cases_hash as cases_hash
-from ops import cases_lookup as cases_lookup
-from ops import cases_marching as cases_marching
-from ops import cases_network as cases_network
-from ops import cases_sampling as cases_sampling
-from ops import cases_step as cases_step
+from harness import Others, Parser, Peaks, Stopwatch, Timing, instruction_set, measure, threads, write_results
+from ops import cases_any, cases_foreign, cases_hash, cases_lookup, cases_network, cases_sampling, cases_step
 from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 
-from voronerf.app.files import write_text
 from voronerf.ops._core import backends
 
 OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
@@ -88,8 +80,8 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
 
 def chosen_cases(options: argparse.Namespace) -> list[Case]:
     """Returns the cases that the options select."""
-    every = [*cases_lookup.cases(), *cases_network.cases(), *cases_sampling.cases(), *cases_marching.cases()]
-    every += [*cases_hash.cases(), *cases_step.cases()]
+    parts = (cases_lookup, cases_network, cases_sampling, cases_hash, cases_step)
+    every = [case for part in parts for case in part.cases()]
     every += cases_any.cases(every)
     if options.foreign:
         every = cases_foreign.cases()
@@ -295,7 +287,7 @@ def main(arguments: list[str] | None = None) -> None:
     bench = Bench(torch.device(options.device), quick=options.quick, wanted=options.backends)
     found, missing = installed()
     print(f"threads {torch.get_num_threads()}; missing: {', '.join(missing) or 'nothing'}", file=sys.stderr)
-    print(f"{processor()}\n")
+    print(f"{harness.processor()}\n")
     print(HEADER, flush=True)
     for number, case in enumerate(cases, 1):
         progress = functools.partial(print, file=sys.stderr, flush=True)
@@ -309,20 +301,20 @@ def main(arguments: list[str] | None = None) -> None:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
         if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
             progress(f"    disturbed: other processes kept {rows[0]['other_load']:.1f} cores busy during this row")
-    if options.json is not None:
-        description = metadata(
-            benchmark="throughput",
-            quick=options.quick,
-            filter=options.filter,
-            device=str(bench.device),
-            seconds=round(time.perf_counter() - start),
-            load=[round(value, 2) for value in load],
-            peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
-            installed=found,
-            missing=missing,
-            warp_cache="as it was" if options.quick else "empty",
-        )
-        write_text(options.json, json.dumps({"metadata": description, "results": bench.rows}, indent=1) + "\n")
+    write_results(
+        options.json,
+        bench.rows,
+        benchmark="throughput",
+        quick=options.quick,
+        filter=options.filter,
+        device=str(bench.device),
+        seconds=round(time.perf_counter() - start),
+        load=[round(value, 2) for value in load],
+        peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
+        installed=found,
+        missing=missing,
+        warp_cache="as it was" if options.quick else "empty",
+    )
 
 
 if __name__ == "__main__":

@@ -4,16 +4,17 @@
     python benchmarks/time_to_quality.py --data LEGO --downscale 4 --seeds 3 --common="--field hashgrid --occupancy"
     python benchmarks/time_to_quality.py --data LEGO --downscale 4 \
         --sides "hash grid: --field hashgrid --occupancy" "4 cells, wide: --cells 4 --width 128" "rival: ngp"
+    python benchmarks/time_to_quality.py --data LEGO --budget 15 --clock cpu --evaluations 4 --eval-views 2 \
+        --common="--samples 256" --sides "2e-4: --lr 2e-4" "1e-3: --lr 1e-3" "0.02: --lr 0.02"
 
 All sides train one scene for the same time. They take turns of a few seconds in one process, so that the noise of a
 shared machine affects all sides alike. All sides are evaluated at the same times on the same views. Evaluation does not
-count as training time.
+count as training time. A side that has learnt nothing scores as ``one_colour``, the PSNR of one-colour pictures.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import shlex
 import statistics
@@ -25,14 +26,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
-from harness import metadata
+from harness import write_results
 from rival_ngp import Rival, RivalConfig
 from turns import CLOCKS, Training, take_turns
 
 from voronerf.app.cli.program import EXPECTED
 from voronerf.app.evaluate.plots import plot_curves
-from voronerf.app.files import write_text
 from voronerf.app.scenes import Scene, load_scene
+from voronerf.app.train.callbacks import one_colour_psnr
 from voronerf.app.train.config import ConfigError, TrainConfig
 
 #: The first word of a side that trains the rival, Instant NGP.
@@ -106,24 +107,18 @@ def make_training(
     """Builds the training of one side with one seed."""
     clock = CLOCKS[options.clock]
     say: Callable[[str], None] = lambda line: print(f"{name:14} {line}", flush=True)  # noqa: E731
+    common = {name: getattr(options, name) for name in ("budget", "evaluations", "eval_views")} | {"seed": seed}
     if isinstance(config, RivalConfig):
-        numbers = {"evaluations": options.evaluations, "eval_views": options.eval_views, "seed": seed}
-        return Rival(config, scene, budget=options.budget, clock=clock, on_event=say, **numbers)
-    config = replace(
-        config,
-        data=options.data,
-        downscale=options.downscale,
-        out=out,
-        seed=seed,
-        budget=options.budget,
-        evaluations=options.evaluations,
-        eval_views=options.eval_views,
-    )
+        return Rival(config, scene, clock=clock, on_event=say, **common)
+    config = replace(config, data=options.data, downscale=options.downscale, out=out, **common)
     return Training(config, scene, on_event=say, clock=clock)
 
 
-def compare(options: Options, folder: Path) -> dict[str, Any]:
-    """Trains every side and seed in turns; returns {metadata, results}."""
+def compare(options: Options, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Trains every side and seed in turns; returns the metadata and the results.
+
+    The metadata have the errors of failed trainings, which have no results.
+    """
     sides = dict(parse_side(text, options.common) for text in options.sides)
     if len(sides) < len(options.sides):
         raise ConfigError(f"--sides must have names of their own, got {', '.join(options.sides)}")
@@ -133,7 +128,15 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         for i, (name, config) in enumerate(sides.items())
         for seed in range(options.seeds)
     }
-    take_turns(trainings.values(), budget=options.budget, turn=options.turn)
+    failed: list[str] = []
+
+    def note_failure(training: Training | Rival, error: Exception) -> None:
+        name, seed = next(key for key, each in trainings.items() if each is training)
+        failed.append(f"{name}, seed {seed}: {error}")
+        print(failed[-1], flush=True)
+        del trainings[name, seed]
+
+    take_turns(trainings.values(), budget=options.budget, turn=options.turn, on_failure=note_failure)
     results = []
     for (name, seed), training in trainings.items():
         summary = training.run()
@@ -142,20 +145,13 @@ def compare(options: Options, folder: Path) -> dict[str, Any]:
         else:
             curve, settings = training.metrics, dataclasses.asdict(training.config)
         settings |= {"data": Path(options.data).name, "out": None}  # paths are meaningless on other machines
-        results.append(
-            {
-                "side": name,
-                "seed": seed,
-                **summary,
-                "seconds_to": {str(quality): seconds_to(quality, curve) for quality in QUALITIES},
-                "curve": curve,
-                "settings": settings,
-            }
-        )
+        reached = {str(quality): seconds_to(quality, curve) for quality in QUALITIES}
+        row = {"side": name, "seed": seed, **summary, "seconds_to": reached, "curve": curve, "settings": settings}
+        results.append(row)
     about = dataclasses.asdict(options) | {"data": scene.name, "sides": list(options.sides)}
     for path in ("json", "plot"):
         about.pop(path)
-    return {"metadata": metadata(benchmark="time_to_quality", **about), "results": results}
+    return about | {"one_colour": one_colour_psnr(scene), "failed": failed}, results
 
 
 def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
@@ -174,13 +170,13 @@ def seconds_to(quality: float, curve: Sequence[dict[str, Any]]) -> float | None:
     return None
 
 
-def table(outcome: dict[str, Any]) -> str:
+def table(about: dict[str, Any], results: list[dict[str, Any]]) -> str:
     """Returns a Markdown table with a row for each side: PSNR at each evaluation and seconds to the qualities.
 
     Each cell is the median over the seeds.
     """
-    about, runs = outcome["metadata"], {}
-    for result in outcome["results"]:
+    runs: dict[str, list[dict[str, Any]]] = {}
+    for result in results:
         runs.setdefault(result["side"], []).append(result)
     times = [about["budget"] * (i + 1) / about["evaluations"] for i in range(about["evaluations"])]
     head = ["side", "steps", "parameters", *(f"{t:.3g} s" for t in times), *(f"to {q} dB" for q in QUALITIES)]
@@ -202,16 +198,15 @@ def table(outcome: dict[str, Any]) -> str:
 def main(options: Options) -> None:
     """Runs the comparison, prints the table, and writes the requested files."""
     with tempfile.TemporaryDirectory() as folder:
-        outcome = compare(options, Path(folder))
-    print(table(outcome))
-    if options.json is not None:
-        write_text(options.json, json.dumps(outcome, indent=1) + "\n")
+        about, results = compare(options, Path(folder))
+    print(table(about, results))
+    write_results(options.json, results, benchmark="time_to_quality", **about)
     if options.plot is not None:
-        several = len({r["seed"] for r in outcome["results"]}) > 1
-        labels = {f"{r['side']}, seed {r['seed']}" if several else r["side"]: r for r in outcome["results"]}
+        several = len({r["seed"] for r in results}) > 1
+        labels = {f"{r['side']}, seed {r['seed']}" if several else r["side"]: r for r in results}
         curves = {label: [(m["seconds"], m["psnr"]) for m in r["curve"]] for label, r in labels.items()}
         splits = {label: [s["started_at_second"] for s in r["stages"][1:]] for label, r in labels.items()}
-        plot_curves(options.plot, curves, splits=splits, title=f"{outcome['metadata']['data']}, equal training time")
+        plot_curves(options.plot, curves, splits=splits, title=f"{about['data']}, equal training time")
 
 
 if __name__ == "__main__":

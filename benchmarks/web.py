@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from harness import metadata
+from harness import write_results
 from numpy.typing import NDArray
 from selenium import webdriver
 from torch import Tensor
 
 from voronerf.app.cli.opening import Opening
-from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.files import json_text, read_json
 from voronerf.app.run import Run
 from voronerf.app.web import export_web
 from voronerf.nerf import Cameras
@@ -153,10 +153,7 @@ def main(options: Options) -> None:
                 row |= compared(run, driver, options.pixels)
             results[path.name] = row
             print(json_text(row, indent=1), flush=True)
-            if options.json is not None:
-                about = metadata(views=VIEWS)
-                found = {"metadata": about, "results": list(results.values())}
-                write_text(options.json, json_text(found, indent=1) + "\n")
+            write_results(options.json, list(results.values()), views=VIEWS)
 
 
 if __name__ == "__main__":

@@ -75,34 +75,43 @@ def row_pieces(bounds: Sequence[int], piece: int | None) -> Iterator[tuple[int, 
             yield cell, first, min(first + step, stop)
 
 
+class Parameters:
+    """The leaf tensors of a contender: one for each parameter and cell or, if ``stacked``, one for each parameter."""
+
+    def __init__(self, batch: Batch, dtype: torch.dtype, stacked: bool = False) -> None:
+        self.net, self.count, self.k, self.stacked = batch.net, len(batch.weights), batch.k, stacked
+        tensors, training = [tensor.detach().to(dtype) for tensor in batch.parameters], batch.direction == BACKWARD
+        parts = [[tensor] if stacked else tensor.unbind() for tensor in tensors]
+        self.parts = [[part.clone().requires_grad_(training) for part in each] for each in parts]
+        self.leaves = [leaf for each in self.parts for leaf in each]
+
+    def cells(self) -> list[tuple[Tensor, ...]]:
+        """Returns weights and biases of each cell."""
+        return list(zip(*[each[0].unbind() if self.stacked else each for each in self.parts]))
+
+    def network(self, cell: tuple[Tensor, ...], x: Tensor, d: Tensor | None) -> Tensor:
+        """Computes a cell's plain torch network."""
+        return join(evaluate(self.net, x, d, cell[: self.count], cell[self.count :], torch_linear))
+
+    def stack(self, found: tuple[Tensor | None, ...]) -> list[Tensor]:
+        """Returns the gradients [k, ...] of the parameters from the gradients of the leaves."""
+        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(self.leaves, found)]
+        return full if self.stacked else [torch.stack(full[at : at + self.k]) for at in range(0, len(full), self.k)]
+
+
 def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: bool = False) -> Contender:
-    """Returns a loop over cells, each a plain torch network.
-
-    Each cell's parameters are separate leaf tensors, unless ``stacked``: then one leaf has the parameters of all cells.
-    """
-    dtype, net = encoded.positions[0].dtype, batch.net
-    parts = [tensor.detach().to(dtype) for tensor in batch.parameters]
-    training, count = batch.direction == BACKWARD, len(batch.weights)
-    if stacked:
-        leaves = [tensor.clone().requires_grad_(training) for tensor in parts]
-    else:
-        per_cell = [[piece.clone().requires_grad_(training) for piece in tensor.unbind()] for tensor in parts]
-        leaves = [leaf for tensor in per_cell for leaf in tensor]
-    pieces = list(row_pieces(batch.bounds, piece))
-
-    def network(x: Tensor, d: Tensor | None, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-        return join(evaluate(net, x, d, weights, biases, torch_linear))
+    """Returns a loop over cells, each a plain torch network."""
+    dtype, device = encoded.positions[0].dtype, encoded.positions[0].device
+    own, pieces = Parameters(batch, dtype, stacked), list(row_pieces(batch.bounds, piece))
 
     def outputs(call: int) -> Iterator[tuple[slice, Tensor]]:
-        x, d = encoded.positions[call % 2], encoded.directions
-        columns = [tensor.unbind() for tensor in leaves] if stacked else per_cell
-        cells = list(zip(*columns))
+        x, d, cells = encoded.positions[call % 2], encoded.directions, own.cells()
         for cell, first, last in pieces:
-            rows, own = slice(first, last), cells[cell]
-            yield rows, network(x[rows], None if d is None else d[rows], own[:count], own[count:])
+            rows = slice(first, last)
+            yield rows, own.network(cells[cell], x[rows], None if d is None else d[rows])
 
     def forward(call: int) -> Tensor:
-        out = torch.empty(batch.n, net.out_features, dtype=dtype, device=parts[0].device)
+        out = torch.empty(batch.n, batch.net.out_features, dtype=dtype, device=device)
         with torch.no_grad():
             for rows, result in outputs(call):
                 out[rows] = result
@@ -110,16 +119,11 @@ def loop(batch: Batch, encoded: Encoded, *, piece: int | None = None, stacked: b
 
     def both(call: int) -> tuple[Tensor, tuple[Tensor | None, ...]]:
         out = torch.cat([result for _, result in outputs(call)])
-        return out, torch.autograd.grad(out, leaves, batch.gradient(call).to(dtype), allow_unused=True)
+        return out, torch.autograd.grad(out, own.leaves, batch.gradient(call).to(dtype), allow_unused=True)
 
-    def adapt(result: tuple[Tensor, tuple[Tensor | None, ...]]) -> tuple[Tensor, list[Tensor]]:
-        out, gradients = result
-        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(leaves, gradients)]
-        if not stacked:
-            full = [torch.stack(full[at : at + batch.k]) for at in range(0, len(full), batch.k)]
-        return out, full
-
-    return Contender(both, adapt) if training else Contender(forward)
+    if batch.direction != BACKWARD:
+        return Contender(forward)
+    return Contender(both, lambda result: (result[0], own.stack(result[1])))
 
 
 def compile_now(run: Callable[[], Any]) -> None:

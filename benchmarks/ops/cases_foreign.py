@@ -7,7 +7,6 @@ with the loop over masks. The loop also uses the library's cell lookup.
 
 from __future__ import annotations
 
-import fnmatch
 import functools
 import itertools
 from collections.abc import Callable, Sequence
@@ -19,13 +18,15 @@ from torch import Tensor, nn
 
 from ops import foreign_fields as fields
 from ops.case import BACKWARD, FORWARD, Case, Contender, NotApplicable, Work, generator, relative_error, uniform_points
+from ops.foreign_rows import share, shared_names
 from voronerf import VoronoiRouter, ops
 
 Arguments = tuple[Tensor, ...]
 Call = Callable[..., Tensor]
 TOLERANCE = 1e-2
 """Largest error against the loop over masks. Gradients change by some per mille if rounding switches a ReLU unit."""
-SMALL, MIDDLE, LARGE = 1 << 10, 1 << 16, 1 << 18
+SIZES = (1 << 10, 1 << 16)
+"""The numbers of samples."""
 
 
 def positions(x: Tensor) -> Arguments:
@@ -38,9 +39,9 @@ def encoded(x: Tensor) -> Arguments:
     return (torch.cat([fields.frequencies(x, 10), fields.frequencies(_directions(x), 4)], -1),)
 
 
-def encoded_and_image(x: Tensor) -> Arguments:
-    """Returns encoded positions and directions, and the image number of each sample."""
-    return (*encoded(x), torch.arange(x.shape[0]).div(64, rounding_mode="floor") % 100)
+def with_image(x: Tensor) -> Arguments:
+    """Returns positions, directions and the image number of each sample, concatenated as Mega-NeRF does."""
+    return (torch.cat([x, _directions(x), torch.arange(len(x))[:, None] // 64 % 100], 1),)
 
 
 def with_directions(x: Tensor) -> Arguments:
@@ -83,7 +84,6 @@ class Field:
         make: A function that makes a new module.
         arguments: A function: positions [n, 3] -> arguments of the module's forward.
         evaluate: A function of the module and its arguments that returns the compared results.
-        most: The largest number of samples, since second derivatives and splines of more samples take several GiB.
         most_cells: The largest number of cells, since the tables of more cells do not fit into memory.
         share: Patterns of the names of the parameters that all cells share. The module's method ``encode`` uses only
             these parameters; its method ``decode`` uses the other ones.
@@ -92,39 +92,35 @@ class Field:
     make: Callable[[], nn.Module]
     arguments: Callable[[Tensor], Arguments] = positions
     evaluate: Callable[[Call, Arguments], list[Tensor]] = values
-    most: int = LARGE
     most_cells: int = 256
     share: tuple[str, ...] = ()
 
 
 FIELDS = {
     "nerf-pytorch w64": Field(fields.nerf, encoded),
-    "nerf-pytorch w256": Field(functools.partial(fields.nerf, 256), encoded, most=MIDDLE, most_cells=16),
-    "appearance": Field(fields.AppearanceNeRF, encoded_and_image),
+    "nerf-pytorch w256": Field(functools.partial(fields.nerf, 256), encoded, most_cells=16),
+    "appearance": Field(fields.mega_nerf, with_image),
     "nerfacc": Field(fields.VanillaField, with_directions),
     "siren": Field(fields.Siren),
-    "siren laplacian": Field(fields.Siren, evaluate=laplacian, most=MIDDLE),
-    "sdf eikonal": Field(fields.SignedDistance, evaluate=normals, most=MIDDLE),
-    "isdf": Field(functools.partial(fields.SignedDistance, 256), evaluate=normals, most=MIDDLE, most_cells=16),
+    "siren laplacian": Field(fields.Siren, evaluate=laplacian),
+    "sdf eikonal": Field(fields.SignedDistance, evaluate=normals),
+    "isdf": Field(functools.partial(fields.SignedDistance, 256), evaluate=normals, most_cells=16),
     "nerfacto table": Field(fields.HashTable),
     "hashnerf 2^14": Field(fields.HashEmbedder),
     "hashnerf 2^19": Field(functools.partial(fields.HashEmbedder, 1 << 19, 4), most_cells=16),
     "tensorf": Field(fields.TensorField),
     "k-planes": Field(fields.KPlanes),
-    "kan": Field(fields.KAN, most=MIDDLE),
+    "kan": Field(fields.KAN),
     "silu": Field(lambda: fields.Activated(nn.SiLU())),
     "leaky relu": Field(lambda: fields.Activated(nn.LeakyReLU(0.2))),
     "tanh": Field(lambda: fields.Activated(nn.Tanh())),
     "gelu": Field(lambda: fields.Activated(nn.GELU())),
     "elu": Field(lambda: fields.Activated(nn.ELU())),
-    "softplus w256": Field(lambda: fields.Activated(nn.Softplus(100), 256), most=MIDDLE, most_cells=16),
-    "weight norm": Field(fields.WeightNormed),
+    "softplus w256": Field(lambda: fields.Activated(nn.Softplus(100), 256), most_cells=16),
     "d-nerf": Field(fields.DNeRF),
     "bacon": Field(fields.Bacon),
     "film": Field(fields.FiLM),
     "layer norm": Field(fields.Normed),
-    "raw weights": Field(fields.RawWeights),
-    "barf": Field(fields.Barf),
     "torch-ngp shared": Field(fields.NeRFNetwork, with_directions, most_cells=16, share=("encoder.*",)),
     "nerfacto shared": Field(fields.HashTable, most_cells=16, share=("hash_table",)),
     "hashnerf shared": Field(fields.HashEmbedder, most_cells=16, share=("embeddings.*",)),
@@ -134,42 +130,15 @@ FIELDS = {
 
 
 def cases() -> list[Case]:
-    """Returns a case for each field, number of samples and cells, direction and number of threads."""
+    """Returns a case for each field, number of samples and cells, and direction, all on one thread."""
     rows = []
-    for name, field in FIELDS.items():
-        for n in (SMALL, MIDDLE, LARGE):
-            for k in (16, 256):
-                for direction in (FORWARD, BACKWARD):
-                    for threads in (1, 2):
-                        if n > field.most or k > field.most_cells:
-                            continue
-                        work = functools.partial(foreign_work, field, n, k, direction)
-                        quick = (n, k, direction, threads) == (SMALL, 16, BACKWARD, 1)
-                        label = f"{name} n={n} k={k} threads={threads}"
-                        needs, dtype = "grouped_linear", torch.float32
-                        rows.append(
-                            Case(
-                                "foreign",
-                                label,
-                                dtype,
-                                direction,
-                                n,
-                                k,
-                                work,
-                                quick=quick,
-                                threads=threads,
-                                needs=needs,
-                            )
-                        )
+    for (name, field), n, k, direction in itertools.product(FIELDS.items(), SIZES, (16, 256), (FORWARD, BACKWARD)):
+        if k <= field.most_cells:
+            work = functools.partial(foreign_work, field, n, k, direction)
+            label, quick = f"{name} n={n} k={k} threads=1", (n, k, direction) == (SIZES[0], 16, BACKWARD)
+            options: dict[str, Any] = {"quick": quick, "threads": 1, "needs": "grouped_linear"}
+            rows.append(Case("foreign", label, torch.float32, direction, n, k, work, **options))
     return rows
-
-
-def _sharing(module: nn.Module, first: nn.Module, names: set[str]) -> nn.Module:
-    """Replaces the named parameters of ``module`` by the parameters of ``first`` with the same names."""
-    for name in names:
-        path, _, last = name.rpartition(".")
-        module.get_submodule(path).register_parameter(last, first.get_parameter(name))
-    return module
 
 
 class Batch:
@@ -187,12 +156,9 @@ class Batch:
         with torch.random.fork_rng():
             torch.manual_seed(0)
             first = field.make()
-            names = [name for name, _ in first.named_parameters()]
-            shared = {name for pattern in field.share for name in fnmatch.filter(names, pattern)}
-            self.modules = [first, *[_sharing(field.make(), first, shared) for _ in range(k - 1)]]
-        self.leaves = [
-            [m.get_parameter(name) for m in self.modules[: None if name not in shared else 1]] for name in names
-        ]
+            shared, names = shared_names(first, field.share), [name for name, _ in first.named_parameters()]
+            self.modules = [first, *[share(field.make(), first, shared) for _ in range(k - 1)]]
+        self.leaves = [[m.get_parameter(name) for m in self.modules[: 1 if name in shared else k]] for name in names]
         self.centres = uniform_points(k, 1000, torch.device("cpu"))
         points = [uniform_points(n, seed, torch.device("cpu")) for seed in range(2)]
         self.arguments = [field.arguments(x) for x in points]

@@ -53,17 +53,8 @@ def cases() -> list[Case]:
         shown = ALL if quick else ("native",)
         cells = int(np.prod(shape))
         rows.append(Case("locate_cell", f"{name} n={count}", single, FORWARD, count, cells, work, shown, quick))
-    for count, k in (
-        (n, 1),
-        (n, 16),
-        (n, 64),
-        (n, 256),
-        (n, 512),
-        (n, 4096),
-        (1024, 256),
-        (1 << 14, 256),
-        (1 << 20, 256),
-    ):
+    sizes = [(n, k) for k in (1, 16, 64, 256, 512, 4096)] + [(count, 256) for count in (1024, 1 << 14, 1 << 20)]
+    for count, k in sizes:
         base = (count, k) == (n, 256)
         work = functools.partial(_sort_work, count, k)
         name = f"n={count} k={k}"

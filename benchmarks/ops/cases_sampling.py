@@ -1,4 +1,7 @@
-"""Cases of frequency_encode, integrated_encode, spherical_harmonics, composite and resample. n points or samples."""
+"""Cases of frequency_encode, spherical_harmonics, composite, resample and march_rays.
+
+n points, samples, or strata of all rays in march_rays; r rays.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from torch import Tensor
 
 from ops.alternatives import compile_now
 from ops.case import BACKWARD, FORWARD, Case, Contender, Work, generator, relative_error, rotation, uniform_points
+from ops.route import torch_encode
 from voronerf import ops
 
 FULL, HALF = torch.float32, torch.bfloat16
@@ -19,8 +23,10 @@ BASE = 1 << 18
 ALL = ("native", "reference", "warp")
 OCTAVES = 10
 DEGREE = 4
-SAMPLES = 64
-"""Samples per ray; for packed rays, their mean number."""
+SAMPLES = STRATA = 64
+"""Samples per ray, for packed rays their mean number, and strata per ray."""
+GRID = 64
+"""Cells of the marched grid along each axis."""
 FINE = 128
 """The number of depths that resample draws from SAMPLES bins."""
 CHECKED = 4096
@@ -39,16 +45,12 @@ def cases() -> list[Case]:
         *[(n, FULL, FORWARD) for n in (1 << 10, 1 << 14, 1 << 20)],
     ):
         base = (n, dtype) == (BASE, FULL)
-        for op in ("frequency_encode", "integrated_encode"):
-            if op == "integrated_encode" and n in (1 << 10, 1 << 14):
-                continue
-            work = functools.partial(_encode_work, op, n, dtype, direction, base)
-            shown = ALL if base else ("native",)
-            quick = base and direction == FORWARD
-            rows.append(Case(op, f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
+        work = functools.partial(_encode_work, "frequency_encode", n, dtype, direction, base)
+        shown, quick = ALL if base else ("native",), base and direction == FORWARD
+        rows.append(Case("frequency_encode", f"L={OCTAVES} n={n}", dtype, direction, n, None, work, shown, quick))
     for n, direction in ((BASE, FORWARD), (BASE, BACKWARD), (1 << 14, FORWARD)):
         base = n == BASE
-        work = functools.partial(_harmonics_work, n, direction, base)
+        work = functools.partial(_encode_work, "spherical_harmonics", n, FULL, direction, base)
         shown = ALL if base else ("native",)
         quick = base and direction == FORWARD
         rows.append(Case("spherical_harmonics", f"degree {DEGREE} n={n}", FULL, direction, n, None, work, shown, quick))
@@ -67,6 +69,11 @@ def cases() -> list[Case]:
         name = f"{SAMPLES} bins {FINE} depths n={n}"
         base = n == BASE
         rows.append(Case("resample", name, FULL, FORWARD, n, None, work, ALL if base else ("native",), base))
+    for n, jitter in ((BASE, False), (BASE, True), (1 << 22, False)):
+        name = f"{'jittered' if jitter else 'middles'} {GRID}^3 n={n}"
+        base, work = n == BASE, functools.partial(_march_work, n, jitter)
+        shown = ALL if base else ("native",)
+        rows.append(Case("march_rays", name, FULL, FORWARD, n, None, work, shown, base and not jitter))
     return rows
 
 
@@ -145,79 +152,46 @@ def _work(
 
 
 def _encode_work(op: str, n: int, dtype: torch.dtype, direction: str, compiled: bool, device: torch.device) -> Work:
-    integrated = op == "integrated_encode"
-    features = 6 * OCTAVES + (0 if integrated else 3)
-    count = rotation(n * (12 + features * dtype.itemsize))
-    sets: list[list[Tensor]] = [[uniform_points(n, seed, device).to(dtype)] for seed in range(count)]
-    if integrated:
-        sets = [[x, (torch.rand(n, 3, generator=generator(9)) * 1e-4).to(device, dtype)] for (x,) in sets]
+    """Builds a case of frequency_encode or of spherical_harmonics; ``compiled`` adds torch.compile."""
+    waves, run = op == "frequency_encode", getattr(ops, op)
+    order, features = (OCTAVES, 6 * OCTAVES + 3) if waves else (DEGREE, DEGREE**2)
+    sets = [[uniform_points(n, seed, device)] for seed in range(rotation(n * (12 + features * dtype.itemsize)))]
+    sets = [[(x if waves else F.normalize(x - 0.5, dim=1)).to(dtype)] for (x,) in sets]
     gradients = None
     if direction == BACKWARD:
         gradients = [torch.randn(n, features, generator=generator(5)).to(device, dtype)]
-    run = getattr(ops, op)
     step = max(1, n // CHECKED)
 
     def exact() -> list[Tensor]:
-        rows = [tensor[::step].double().contiguous() for tensor in sets[0]]
+        rows = [sets[0][0][::step].double().contiguous()]
         given = None if gradients is None else [gradients[0][::step].double()]
-        return _flat(_contender(lambda *x: run(*x, OCTAVES, backend="reference"), [rows], given).run(0))
+        return _flat(_contender(lambda x: run(x, order, backend="reference"), [rows], given).run(0))
 
-    functions: dict[str, Function] = (
-        {"torch, octave by octave": _integrated_by_octave}
-        if integrated
-        else {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": _frequency_at_once}
-    )
+    functions: dict[str, Function] = {"torch, value by value": harmonics_by_value}
+    if waves:
+        at_once = functools.partial(torch_encode, octaves=OCTAVES, dtype=dtype)
+        functions = {"torch, octave by octave": _frequency_by_octave, "torch, all octaves at once": at_once}
     # Minimum bytes: forward reads points and writes features; backward reads points and gradients, writes gradients.
-    raw = (6 if integrated else 3) * dtype.itemsize
-    amount = float(n) * (raw + features * dtype.itemsize)
+    amount = float(n) * (3 + features) * dtype.itemsize
     if direction == BACKWARD:
-        amount += float(n) * (2 * raw + features * dtype.itemsize)
+        amount += float(n) * (6 + features) * dtype.itemsize
+    # bfloat16 rounds angles of hundreds of radians by more than a radian.
+    tolerance = 1.5 if dtype == HALF else 1e-3 if waves else 1e-5
     return _work(
-        lambda *x, backend: run(*x, OCTAVES, backend=backend),
+        lambda x, backend: run(x, order, backend=backend),
         functions,
         sets,
         gradients,
         lambda found: [tensor[::step] for tensor in found],
         exact,
         amount,
-        ["torch, octave by octave"] if compiled else [],  # the other alternative is slower, especially backward
-        1e-3 if dtype == FULL else 1.5,  # bfloat16 rounds angles of hundreds of radians by more than a radian
+        list(functions)[:compiled],  # the other alternative is slower, especially backward
+        tolerance,
     )
 
 
-def _harmonics_work(n: int, direction: str, compiled: bool, device: torch.device) -> Work:
-    features = DEGREE**2
-    sets = [
-        [F.normalize(uniform_points(n, seed, device) - 0.5, dim=1)] for seed in range(rotation(n * 4 * (3 + features)))
-    ]
-    gradients = None
-    if direction == BACKWARD:
-        gradients = [torch.randn(n, features, generator=generator(5)).to(device)]
-    run, step = ops.spherical_harmonics, max(1, n // CHECKED)
-
-    def exact() -> list[Tensor]:
-        rows = [sets[0][0][::step].double()]
-        given = None if gradients is None else [gradients[0][::step].double()]
-        return _flat(_contender(lambda x: run(x, DEGREE, backend="reference"), [rows], given).run(0))
-
-    amount = float(n) * 4 * (3 + features)
-    if direction == BACKWARD:
-        amount += float(n) * 4 * (6 + features)
-    return _work(
-        lambda x, backend: run(x, DEGREE, backend=backend),
-        {"torch, value by value": _harmonics_by_value},
-        sets,
-        gradients,
-        lambda found: [tensor[::step] for tensor in found],
-        exact,
-        amount,
-        ["torch, value by value"] if compiled else [],
-        1e-5,
-    )
-
-
-def _harmonics_by_value(directions: Tensor) -> Tensor:
-    """Computes harmonics column by column, as nerfstudio does."""
+def harmonics_by_value(directions: Tensor) -> Tensor:
+    """Computes spherical harmonics [n, 16] of unit directions [n, 3] column by column, as nerfstudio does."""
     x, y, z = directions.unbind(1)
     xx, yy, zz = x**2, y**2, z**2
     out = directions.new_empty(directions.shape[0], 16)
@@ -245,23 +219,6 @@ def _frequency_by_octave(x: Tensor) -> Tensor:
     for octave in range(OCTAVES):
         parts += [torch.sin(x * 2.0**octave), torch.cos(x * 2.0**octave)]
     return torch.cat(parts, 1)
-
-
-def _frequency_at_once(x: Tensor) -> Tensor:
-    angles = x[:, None, None, :] * _powers(x)
-    return torch.cat([x, torch.cat([angles.sin(), angles.cos()], 2).flatten(1)], 1)
-
-
-def _integrated_by_octave(mean: Tensor, variance: Tensor) -> Tensor:
-    parts = []
-    for octave in range(OCTAVES):
-        blur = torch.exp(-0.5 * 4.0**octave * variance)
-        parts += [torch.sin(mean * 2.0**octave) * blur, torch.cos(mean * 2.0**octave) * blur]
-    return torch.cat(parts, 1)
-
-
-def _powers(x: Tensor) -> Tensor:
-    return (2.0 ** torch.arange(OCTAVES, device=x.device)).to(x.dtype)[None, :, None, None]
 
 
 def _composite_work(n: int, packed: bool, direction: str, device: torch.device) -> Work:
@@ -389,3 +346,88 @@ def _resample_torch(weights: Tensor, edges: Tensor) -> Tensor:
     inside = (u - low) / (high - low).clamp(min=1e-10)
     near, far = edges.gather(1, above - 1), edges.gather(1, above)
     return near + inside * (far - near)
+
+
+def _march_work(n: int, jitter: bool, device: torch.device) -> Work:
+    rays = n // STRATA
+    box, occupied = torch.tensor(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))).to(device), _shell().to(device)
+
+    def batch(seed: int) -> tuple[list[Tensor], Tensor | None]:
+        random = generator(seed)
+        origins = 4 * F.normalize(torch.randn(rays, 3, generator=random), dim=1)
+        directions = F.normalize(torch.rand(rays, 3, generator=random) - 0.5 - origins, dim=1)
+        near, far = (torch.full((rays,), value) for value in (2.9, 5.1))
+        uniforms = torch.rand(rays, STRATA, generator=random).to(device) if jitter else None
+        return [tensor.to(device) for tensor in (origins, directions, near, far)], uniforms
+
+    sets = [batch(seed) for seed in range(rotation(32 * rays + (4 * n if jitter else 0)))]
+    exact = ops.march_rays(*sets[0][0], occupied, box, STRATA, uniforms=sets[0][1], backend="reference")
+
+    def contender(function: Callable[..., Any]) -> Contender:
+        def run(call: int) -> Any:
+            tensors, uniforms = sets[call % len(sets)]
+            return function(*tensors, occupied, box, STRATA, uniforms=uniforms)
+
+        return Contender(run)
+
+    def error(found: Any) -> float:
+        """Returns the error of the depths against float64, or the fraction of rays whose number of samples differs."""
+        others = float((found[0].diff() != exact.ray_offsets.diff()).double().mean())
+        if found[1].shape != exact.ray_index.shape or not torch.equal(found[1], exact.ray_index):
+            return others or float("inf")  # counts agree, but samples belong to other rays
+        return relative_error(found[2], _exact_depths(*sets[0], exact))
+
+    # Minimum bytes: read the rays (and the jitter), look up a byte for each stratum, write the kept samples.
+    amount = 32.0 * rays + n * (5.0 if jitter else 1.0) + 24.0 * exact.ray_index.shape[0] + 8.0 * rays
+    return Work(
+        lambda backend: contender(functools.partial(ops.march_rays, backend=backend)),
+        {"torch, all strata and a mask": lambda: contender(_march_masked)},
+        error,
+        0.01,  # rounding may move a sample across a border of its grid cell
+        amount,
+        "copy",
+    )
+
+
+def _shell() -> Tensor:
+    """Returns a grid in which a thick spherical shell is occupied, about a tenth of the cells."""
+    middles = (torch.arange(GRID) + 0.5) / GRID * 2 - 1
+    x, y, z = torch.meshgrid(middles, middles, middles, indexing="ij")
+    return ((x * x + y * y + z * z).sqrt() - 0.7).abs() < 0.07
+
+
+def _exact_depths(rays: list[Tensor], uniforms: Tensor | None, found: Any) -> Tensor:
+    """Returns the float64 depths of the kept samples."""
+    near, far = (rays[i].double()[found.ray_index.long()] for i in (2, 3))
+    # The depth determines the stratum, because rounding does not move a depth out of its stratum.
+    share = (found.depths.double() - near) / (far - near) * STRATA
+    stratum = (share - 0.5).round() if uniforms is None else share.floor().clamp(0, STRATA - 1)
+    inside = 0.5 if uniforms is None else uniforms[found.ray_index.long(), stratum.long()].double()
+    return near + (far - near) * (stratum + inside) / STRATA
+
+
+def _march_masked(
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    occupied: Tensor,
+    box: Tensor,
+    samples: int,
+    *,
+    uniforms: Tensor | None,
+) -> tuple[Tensor, ...]:
+    """Marches without the op, as a user would: the cell of every sample, then a mask of occupied samples."""
+    r, size = origins.shape[0], occupied.shape[0]
+    stratum = torch.arange(samples, device=near.device)
+    at = (stratum + (0.5 if uniforms is None else uniforms)) / samples
+    length = (far - near)[:, None]
+    depths = near[:, None] + length * at
+    positions = torch.addcmul(origins[:, None], depths[..., None], directions[:, None])
+    place = (positions - box[0]) / (box[1] - box[0]) * size
+    inside = ((place >= 0) & (place <= size)).all(-1)
+    x, y, z = place.long().clamp_(0, size - 1).unbind(-1)
+    kept = inside & occupied.reshape(-1)[(x * size + y) * size + z]
+    offsets = F.pad(kept.sum(1).cumsum(0), (1, 0)).int()
+    ray = torch.arange(r, device=near.device, dtype=torch.int32)[:, None].expand(r, samples)[kept]
+    return offsets, ray, depths[kept], (length / samples).expand(r, samples)[kept], positions[kept]

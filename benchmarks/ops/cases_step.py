@@ -140,9 +140,7 @@ def loss_work(b: int, m: int, device: torch.device) -> Work:
     exact = by_ours(sets[0].double())
     return Work(
         lambda backend: contender(functools.partial(by_ours, backend=backend)),
-        {
-            "activations, composite, mse_loss": lambda: contender(by_composite),
-        },
+        {"activations, composite, mse_loss": lambda: contender(by_composite)},
         _worst(exact),
         1e-2,
         m * 4.0 * (4 + 4 + 1),

@@ -19,12 +19,6 @@ from torch import Tensor, nn
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-def frequencies(x: Tensor, octaves: int) -> Tensor:
-    """Returns ``x`` followed by sine and cosine of each octave: [n, d] -> [n, d * (1 + 2 * octaves)]."""
-    waves = [wave(x * 2.0**octave) for octave in range(octaves) for wave in (torch.sin, torch.cos)]
-    return torch.cat([x, *waves], -1)
-
-
 def example(name: str) -> ModuleType:
     """Imports the script `name` from `examples/`, which has a stand-in for a codebase."""
     full = f"examples_{name}"
@@ -34,6 +28,10 @@ def example(name: str) -> ModuleType:
         sys.modules[full] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules[full])
     return sys.modules[full]
+
+
+frequencies = example("nerf_pytorch").encode
+"""A function (x [n, d], octaves) that returns x followed by sine and cosine of each octave, [n, d (1 + 2 octaves)]."""
 
 
 def nerf(width: int = 64) -> nn.Module:
@@ -49,60 +47,20 @@ def skip_net(points: int = 9, views: int = 6) -> nn.Module:
     return module
 
 
-class AppearanceNeRF(nn.Module):
-    """The NeRF-W of nerf_pl: an appearance code per image beside the direction."""
-
-    def __init__(self, width: int = 64, images: int = 100, code: int = 48) -> None:
-        super().__init__()
-        self.embedding_a = nn.Embedding(images, code)
-        for i in range(8):
-            size = 63 if i == 0 else width + 63 if i == 4 else width
-            setattr(self, f"xyz_encoding_{i + 1}", nn.Sequential(nn.Linear(size, width), nn.ReLU(True)))
-        self.xyz_encoding_final = nn.Linear(width, width)
-        self.dir_encoding = nn.Sequential(nn.Linear(width + 27 + code, width // 2), nn.ReLU(True))
-        self.static_sigma = nn.Sequential(nn.Linear(width, 1), nn.Softplus())
-        self.static_rgb = nn.Sequential(nn.Linear(width // 2, 3), nn.Sigmoid())
-
-    def forward(self, x: Tensor, image: Tensor) -> Tensor:
-        points, views = torch.split(x, [63, 27], dim=-1)
-        h = points
-        for i in range(8):
-            if i == 4:
-                h = torch.cat([points, h], 1)
-            h = getattr(self, f"xyz_encoding_{i + 1}")(h)
-        sigma = self.static_sigma(h)
-        h = torch.cat([self.xyz_encoding_final(h), views, self.embedding_a(image)], 1)
-        return torch.cat([self.static_rgb(self.dir_encoding(h)), sigma], 1)
+def mega_nerf() -> nn.Module:
+    """Returns the network of Mega-NeRF, whose last input is an image's number, for an appearance code per image."""
+    module: nn.Module = example("mega_nerf").NeRF(layer_dim=64, appearance_count=100)
+    return module
 
 
-class VanillaField(nn.Module):
+class VanillaField(example("nerfacc_field").VanillaNeRFRadianceField):
     """The field of nerfacc: encoders inside, a base with a skip connection, density and colour heads."""
 
-    scales: Tensor
-
-    def __init__(self, width: int = 64, depth: int = 4) -> None:
-        super().__init__()
-        self.register_buffer("scales", torch.tensor([2.0**i for i in range(10)]))
-        sizes = [63] + [width + (63 if i == 2 else 0) for i in range(1, depth)]
-        self.hidden_layers = nn.ModuleList([nn.Linear(size, width) for size in sizes])
-        self.hidden_activation = nn.ReLU()
-        self.sigma_layer, self.bottleneck_layer = nn.Linear(width, 1), nn.Linear(width, width)
-        self.rgb_hidden, self.rgb_layer = nn.Linear(width + 27, width // 2), nn.Linear(width // 2, 3)
-
-    def encode(self, x: Tensor, octaves: int) -> Tensor:
-        xb = torch.reshape(x[..., None, :] * self.scales[:octaves, None], [*x.shape[:-1], octaves * 3])
-        return torch.cat([x, torch.sin(torch.cat([xb, xb + 0.5 * math.pi], dim=-1))], dim=-1)
+    def __init__(self) -> None:
+        super().__init__(net_depth=4, net_width=64, skip_layer=2, net_width_condition=32)
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        x = inputs = self.encode(x, 10)
-        for i, layer in enumerate(self.hidden_layers):
-            if i == 2:
-                x = torch.cat([x, inputs], dim=-1)
-            x = self.hidden_activation(layer(x))
-        sigma = F.relu(self.sigma_layer(x))
-        x = torch.cat([self.bottleneck_layer(x), self.encode(condition, 4)], dim=-1)
-        rgb = torch.sigmoid(self.rgb_layer(self.hidden_activation(self.rgb_hidden(x))))
-        return torch.cat([rgb, sigma], dim=-1)
+        return torch.cat(super().forward(x, condition), dim=-1)
 
 
 class Sine(nn.Module):
@@ -156,7 +114,17 @@ class SignedDistance(nn.Module):
         return x
 
 
-class HashTable(nn.Module):
+class Encoded(nn.Module):
+    """A field of an encoding, which cells may share, and a small head."""
+
+    def decode(self, features: Tensor) -> Tensor:
+        return cast(Tensor, self.head(features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.decode(self.encode(x))
+
+
+class HashTable(Encoded):
     """The hash encoding of nerfacto in torch: ``table[index]`` for eight corners of all levels, and a small head."""
 
     scalings: Tensor
@@ -193,14 +161,8 @@ class HashTable(nn.Module):
             corners = [a * (1 - w) + b * w for a, b in zip(corners[::2], corners[1::2])]
         return torch.flatten(corners[0], start_dim=-2, end_dim=-1)
 
-    def decode(self, features: Tensor) -> Tensor:
-        return cast(Tensor, self.head(features))
 
-    def forward(self, positions: Tensor) -> Tensor:
-        return self.decode(self.encode(positions))
-
-
-class HashEmbedder(nn.Module):
+class HashEmbedder(Encoded):
     """The encoding of HashNeRF: one ``nn.Embedding`` per level, looked up at eight corners, and a small head."""
 
     def __init__(self, entries: int = 1 << 14, levels: int = 16, width: int = 64) -> None:
@@ -229,12 +191,6 @@ class HashEmbedder(nn.Module):
                 voxel = voxel[:, :half] * (1 - w) + voxel[:, half:] * w
             levels.append(voxel[:, 0])
         return torch.cat(levels, dim=-1)
-
-    def decode(self, features: Tensor) -> Tensor:
-        return cast(Tensor, self.head(features))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.decode(self.encode(x))
 
 
 class GridEncoder(nn.Module):
@@ -294,7 +250,7 @@ class NeRFNetwork(nn.Module):
         return self.decode(self.encode(x), d)
 
 
-class TensorField(nn.Module):
+class TensorField(Encoded):
     """The vector-matrix factors of TensoRF: planes and lines read by ``F.grid_sample``."""
 
     def __init__(self, size: int = 64, components: int = 16, width: int = 64) -> None:
@@ -303,7 +259,7 @@ class TensorField(nn.Module):
         self.plane = nn.ParameterList([nn.Parameter(0.1 * torch.randn(1, components, size, size)) for _ in range(3)])
         self.line = nn.ParameterList([nn.Parameter(0.1 * torch.randn(1, components, size, 1)) for _ in range(3)])
         self.basis_mat = nn.Linear(3 * components, 27, bias=False)
-        self.render = nn.Sequential(nn.Linear(27, width), nn.ReLU(), nn.Linear(width, 4))
+        self.head = nn.Sequential(nn.Linear(27, width), nn.ReLU(), nn.Linear(width, 4))
 
     def encode(self, xyz: Tensor) -> Tensor:
         plane = torch.stack([xyz[..., mode] for mode in self.mat_mode]).detach().view(3, -1, 1, 2)
@@ -316,13 +272,10 @@ class TensorField(nn.Module):
         return (torch.cat(planes) * torch.cat(lines)).T
 
     def decode(self, features: Tensor) -> Tensor:
-        return cast(Tensor, self.render(self.basis_mat(features)))
-
-    def forward(self, xyz: Tensor) -> Tensor:
-        return self.decode(self.encode(xyz))
+        return cast(Tensor, self.head(self.basis_mat(features)))
 
 
-class KPlanes(nn.Module):
+class KPlanes(Encoded):
     """The field of K-Planes: products of plane features at several resolutions, and a small head."""
 
     def __init__(self, sizes: tuple[int, ...] = (32, 64), components: int = 16, width: int = 64) -> None:
@@ -331,7 +284,7 @@ class KPlanes(nn.Module):
             nn.ParameterList([nn.Parameter(torch.rand(1, components, size, size) * 0.4 + 0.1) for _ in range(3)])
             for size in sizes
         )
-        self.sigma_net = nn.Sequential(nn.Linear(len(sizes) * components, width), nn.ReLU(), nn.Linear(width, 4))
+        self.head = nn.Sequential(nn.Linear(len(sizes) * components, width), nn.ReLU(), nn.Linear(width, 4))
 
     def encode(self, pts: Tensor) -> Tensor:
         features = []
@@ -343,12 +296,6 @@ class KPlanes(nn.Module):
                 product = product * found.view(1, plane.shape[1], -1).transpose(-1, -2).squeeze(0)
             features.append(product)
         return torch.cat(features, dim=-1)
-
-    def decode(self, features: Tensor) -> Tensor:
-        return cast(Tensor, self.sigma_net(features))
-
-    def forward(self, pts: Tensor) -> Tensor:
-        return self.decode(self.encode(pts))
 
 
 class SplineLayer(nn.Module):
@@ -404,23 +351,6 @@ class Activated(nn.Module):
         for layer in self.layers:
             x = self.activation(layer(x))
         return cast(Tensor, self.head(x))
-
-
-class WeightNormed(nn.Module):
-    """A network of IDR and VolSDF: weight norm, softplus(100), several outputs."""
-
-    def __init__(self, width: int = 64) -> None:
-        super().__init__()
-        norm = nn.utils.parametrizations.weight_norm
-        self.layers = nn.ModuleList([norm(nn.Linear(39 if i == 0 else width, width)) for i in range(4)])
-        self.head, self.softplus = norm(nn.Linear(width, 1 + width)), nn.Softplus(beta=100)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = frequencies(x, 6)
-        for layer in self.layers:
-            x = self.softplus(layer(x))
-        sdf, features = torch.split(self.head(x), [1, x.shape[-1]], dim=-1)
-        return torch.cat([sdf, features / features.norm(dim=-1, keepdim=True)], -1)
 
 
 class DNeRF(nn.Module):
@@ -490,45 +420,6 @@ class Normed(nn.Module):
         return cast(Tensor, self.head(h))
 
 
-class RawWeights(nn.Module):
-    """A field like KiloNeRF's with raw weights: ``x @ W``, ``addmm``, ``einsum``, ``matmul`` of a transposed weight."""
-
-    def __init__(self, width: int = 64) -> None:
-        super().__init__()
-        sizes = [(3, width), (width, width), (width, width), (width, 4)]
-        self.w = nn.ParameterList([nn.Parameter(torch.randn(i, o) / math.sqrt(i)) for i, o in sizes])
-        self.b = nn.Parameter(torch.zeros(width))
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = torch.tanh(x @ self.w[0])
-        x = F.gelu(torch.addmm(self.b, x, self.w[1]), approximate="tanh")
-        x = F.leaky_relu(torch.einsum("ni,io->no", x, self.w[2]), 0.2)
-        return x.matmul(self.w[3].permute(1, 0).t())
-
-
-class Barf(nn.Module):
-    """The field of BARF: an encoding whose octaves are weighted by the training progress, and constants of x's type."""
-
-    progress: Tensor
-
-    def __init__(self, width: int = 64) -> None:
-        super().__init__()
-        self.register_buffer("progress", torch.tensor(0.4))
-        self.layers = nn.ModuleList([nn.Linear(39 if i == 0 else width, width) for i in range(3)])
-        self.head = nn.Linear(width, 4)
-
-    def forward(self, x: Tensor) -> Tensor:
-        with torch.no_grad():
-            octaves = torch.arange(6, dtype=torch.float32).type_as(x)
-            weights = (1 - ((self.progress * 6 - octaves).clamp(0, 1) * math.pi).cos()) / 2
-        angles = x[..., None] * 2.0**octaves * math.pi
-        waves = torch.stack([angles.sin(), angles.cos()], -2) * weights
-        h = torch.cat([x, waves.flatten(-3)], -1)
-        for layer in self.layers:
-            h = torch.relu(layer(h))
-        return cast(Tensor, self.head(h))
-
-
 class LearnedSine(nn.Module):
     """A small network with sines of scaled layers, a learned frequency and a residual block."""
 
@@ -565,32 +456,3 @@ class Heads(nn.Module):
 
     def color(self, x: Tensor, d: Tensor, features: Tensor) -> Tensor:
         return torch.sigmoid(self.colour(torch.cat([d, features], -1)))
-
-    def query_density(self, x: Tensor) -> Tensor:
-        return self.density(x)["sigma"][..., None]
-
-    def query_opacity(self, x: Tensor, step_size: float = 0.01) -> Tensor:
-        return self.query_density(x) * step_size
-
-    def get_density(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        sigma, features = torch.split(self.net(x), [1, 4], dim=-1)
-        return F.relu(sigma), features
-
-    def sdf(self, x: Tensor) -> Tensor:
-        return cast(Tensor, self.net(x)[:, :1])
-
-    def occupancy(self, x: Tensor) -> Tensor:
-        return torch.sigmoid(-10 * self.sdf(x))
-
-    def features(self, x: Tensor, *, scale: float = 2.0, normalise: bool = True) -> Tensor:
-        h = self.net(x)[..., 1:] * scale
-        return F.normalize(h, dim=-1) if normalise else h
-
-    def alpha(self, x: Tensor, distance: Tensor) -> Tensor:
-        return 1 - torch.exp(-self.query_density(x) * distance)
-
-    def warp(self, x: Tensor, t: Tensor) -> Tensor:
-        return x + t * torch.tanh(self.net(x)[..., :3])
-
-    def both(self, x: Tensor, d: Tensor) -> list[Tensor]:
-        return [self(x, d)[0], self(x, -d)[0]]

@@ -125,11 +125,7 @@ def encoding(n_input_dims: int, encoding_config: dict[str, Any], **_: Any) -> nn
 
 
 def encoded_network(
-    n_input_dims: int,
-    n_output_dims: int,
-    encoding_config: dict[str, Any],
-    network_config: dict[str, Any],
-    **_: Any,
+    n_input_dims: int, n_output_dims: int, encoding_config: dict[str, Any], network_config: dict[str, Any], **_: Any
 ) -> nn.Module:
     """Returns the stand-in for a network with an encoding of tiny-cuda-nn."""
     first = encoding(n_input_dims, encoding_config)

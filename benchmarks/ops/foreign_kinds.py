@@ -11,7 +11,6 @@ import warnings
 from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -20,15 +19,18 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from ops import foreign_fields as fields
-from ops.foreign_imports import GridEncoder, SHEncoder
-from ops.foreign_rows import Row, evaluated, inner, uniform
+from ops.foreign_imports import SHEncoder
+from ops.foreign_rows import Row, evaluated, inner, numbers, of, per_ray, uniform
 from voronerf import NeRF
 from voronerf.router import register
 
 W = 24  # width
+images = numbers(9)
 RAYS = (29, 7)  # rays and samples of a ray: different from all numbers of features
 BOTH, GROUPED, BY_CELL = ("fused", "grouped"), ("grouped",), ("cell by cell",)
 Part = int | tuple[int, int] | Callable[[], Any]
+KINDS: dict[str, list[Row]] = {}
+"""The rows of each kind, by its name."""
 
 
 class Module(nn.Module):
@@ -117,10 +119,6 @@ def layers(*sizes: int) -> Callable[[], nn.ModuleList]:
     return lambda: nn.ModuleList(nn.Linear(i, o) for i, o in itertools.pairwise(sizes))
 
 
-def images(lead: tuple[int, ...]) -> Tensor:
-    return torch.randint(0, 9, lead)
-
-
 # plain ----------------------------------------------------------------------------------------------------------------
 
 
@@ -135,14 +133,6 @@ def trunk() -> nn.ModuleList:
     return nn.ModuleList([nn.Linear(3, W), nn.Linear(W, W), nn.Linear(W + 3, W)])
 
 
-def counted(s: Any, x: Tensor) -> Tensor:
-    for i in range(len(s.net)):
-        x = s.net[i](x)
-        if i < len(s.net) - 1:
-            x = torch.relu_(x)
-    return x
-
-
 def by_name(s: Any, x: Tensor) -> Tensor:
     for i in range(3):
         x = getattr(s, f"lin{i}")(x)
@@ -150,23 +140,10 @@ def by_name(s: Any, x: Tensor) -> Tensor:
     return x
 
 
-def narrowed(s: Any, x: Tensor, only: bool = False) -> Tensor:
-    h = F.relu(s.a(x[..., :3]))
-    sigma = s.sigma(h)
-    return sigma if only else torch.cat([s.b(torch.cat([h, x[..., 3:]], -1)), sigma], -1)
-
-
-PLAIN = [
-    Row("NeRF", fields.nerf, (90,)),
-    Row("nerfacc", fields.VanillaField, (3, 3)),
-    Row("D-NeRF", fields.DNeRF, (3,)),
-    Row("BARF", fields.Barf, (3,)),
+KINDS["plain"] = [
     own("skip and view", skipping, 3, 3, trunk=trunk, view=(W + 3, W), rgb=(W, 3), sigma=(W, 1), ways=BOTH),
-    own("list by number, relu_", counted, net=layers(3, W, W, 4)),
     own("layers by name", by_name, lin0=(3, W), lin1=(W, W), lin2=(W, 4), act=nn.ReLU, ways=BOTH),
     own("sequential", lambda s, x: s.net(x), net=mlp(3, 4, lambda: nn.ReLU(inplace=True))),
-    own("slices", narrowed, 9, sigma=(W, 1), b=(W + 6, 3)),
-    own("sum of layers", lambda s, x, d: s.o(F.relu(s.a(x) + s.b(d))), 3, 5, b=(5, W)),
     own("stack of heads", lambda s, x: torch.stack([h(x) for h in s.h], 1).mean(1), h=layers(3, 3, 3, 3)),
 ]
 
@@ -185,24 +162,10 @@ def harmonics(s: Any, d: Tensor) -> Tensor:
     return s.net(values)
 
 
-def integrated(s: Any, mean: Tensor, variance: Tensor) -> Tensor:
-    y = (mean[..., None, :] * s.f[:, None]).flatten(-2)
-    v = (variance[..., None, :].exp() * s.f[:, None] ** 2).flatten(-2)
-    waves = torch.exp(-0.5 * torch.cat([v, v], -1)) * torch.sin(torch.cat([y, y + 0.5 * math.pi], -1))
-    return s.net(waves)
-
-
 def contracted(s: Any, x: Tensor) -> Tensor:
     x = 2 * x
     size = x.norm(dim=-1, keepdim=True).clamp_min(1e-3)
     return s.net(torch.where(size <= 1, x, (2 - 1 / size) * (x / size)))
-
-
-def listed(s: Any, x: Tensor) -> Tensor:
-    out = [x]
-    for f in s.f:
-        out += [torch.sin(f * x), torch.cos(f * x)]
-    return s.net(torch.cat(out, -1))
 
 
 def products(s: Any, x: Tensor) -> Tensor:
@@ -210,27 +173,13 @@ def products(s: Any, x: Tensor) -> Tensor:
     return s.net(torch.cat([projected.sin(), projected.cos()], 1).transpose(2, 1).contiguous().view(len(x), -1))
 
 
-ENCODINGS = [
-    own("list", listed, f=octaves(4), net=27),
+KINDS["encodings"] = [
     own("einsum", products, f=octaves(4), net=24, ways=BOTH),
-    own(
-        "stack",
-        lambda s, x: s.net(torch.stack([(x[..., None] * s.f).sin(), (x[..., None] * s.f).cos()], -1).flatten(-3)),
-        f=octaves(4),
-        net=24,
-    ),
     own("Gaussian", lambda s, x: s.net(torch.cat([(x @ s.b).sin(), (x @ s.b).cos()], -1)), b=buffer(3, 16), net=32),
-    own("Gaussian, turned", lambda s, x: s.net(torch.cos(F.linear(x, s.b) + 0.3)), b=buffer(16, 3), net=16),
     own("learned", lambda s, x: s.net((x[:, None] * s.f[:, None]).flatten(1).sin()), f=parameter(5), net=15),
-    own("integrated", integrated, 3, 3, f=octaves(4), net=24),
     own("harmonics, written", harmonics, net=9, ways=BOTH),
     own("harmonics, stacked", lambda s, d: s.net(s.e(d)), e=SHEncoder, net=16),
     own("contraction", contracted),
-    own(
-        "box",
-        lambda s, x: s.net((x - s.box[0]) / (s.box[1] - s.box[0]) * 2 - 1),
-        box=lambda: torch.tensor([[-2.0] * 3, [2.0] * 3]),
-    ),
     own("octaves by power", lambda s, x: s.net(torch.cat([torch.sin(2.0**i * x) for i in range(4)], -1)), net=12),
 ]
 
@@ -244,13 +193,10 @@ def spelled(name: str, call: Callable[[Tensor], Any], **more: Any) -> Row:
     return own(name, lambda s, x: call(s.net(x)), **more)
 
 
-OUTPUTS = [
+KINDS["outputs"] = [
     spelled("tuple of split", lambda h: torch.split(h, [3, 1], -1)),
-    spelled("unpacked split", lambda h: (lambda rgb, sigma: (rgb, sigma))(*h.split([3, 1], dim=-1))),
     spelled("piece of split", lambda h: torch.split(h, 2, -1)[1]),
-    spelled("dict of split", lambda h: dict(zip(("rgb", "sigma"), torch.split(h, [3, 1], -1)))),
     spelled("chunk", lambda h: h.chunk(2, dim=-1)),
-    spelled("piece of chunk", lambda h: torch.chunk(h, 4, -1)[2]),
     spelled("list of unbind", lambda h: list(h.unbind(-1))),
     spelled("piece of unbind", lambda h: torch.unbind(h, dim=1)[0]),
     spelled("tensor_split", lambda h: h.tensor_split((1, 3), dim=-1)),
@@ -265,7 +211,7 @@ OUTPUTS = [
 
 NAMES = "ReLU SiLU GELU ELU SELU Mish Tanh Sigmoid Softplus Softsign Hardtanh ReLU6 LogSigmoid Tanhshrink"
 GIVEN = [nn.GELU("tanh"), nn.Softplus(100), nn.LeakyReLU(0.2), nn.Softmax(-1)]
-ACTIVATIONS = [
+KINDS["activations"] = [
     Row(str(kind), lambda kind=kind: fields.Activated(kind, 32), ways=BOTH if kind is GIVEN[1] else ())
     for kind in (*(getattr(nn, name)() for name in NAMES.split()), *GIVEN)
 ]
@@ -273,32 +219,17 @@ ACTIVATIONS = [
 # periodic -------------------------------------------------------------------------------------------------------------
 
 
-def gabor(s: Any, x: Tensor) -> Tensor:
-    return s.o(torch.cos(10 * s.a(x)) * torch.exp(-((3 * s.b(x)) ** 2)))
-
-
-def distances(s: Any, x: Tensor) -> Tensor:
-    """Computes Gabor filters of a multiplicative network, each with its centre and width."""
-    d = (x**2).sum(-1)[..., None] + (s.mu**2).sum(-1)[None, :] - 2 * x @ s.mu.T
-    return s.o(torch.sin(s.a(x)) * torch.exp(-0.5 * d * s.gamma[None, :]))
-
-
 def periodic(name: str, wave: Callable[..., Tensor], **parts: Part) -> Row:
     return own(name, lambda s, x: s.o(wave(s, s.b(wave(s, s.a(x))))), second=True, **parts)
 
 
-PERIODIC = [
+KINDS["periodic"] = [
     Row("SIREN", fields.Siren, (3,), second=True),
     Row("FiLM", fields.FiLM, (3,)),
     Row("BACON", fields.Bacon, (3,)),
-    own("Gabor", gabor, second=True, b=(3, W)),
-    own("Gabor filters", distances, mu=parameter(W, 3), gamma=lambda: nn.Parameter(torch.rand(W))),
-    periodic("sine", lambda s, h: torch.sin(6 * h)),
     periodic("learned sine", lambda s, h: torch.sin(s.w * h), w=number(3.0), ways=BOTH),
     periodic("FINER", lambda s, h: torch.sin(3 * (h.abs() + 1) * h)),
-    periodic("Gaussian", lambda s, h: torch.exp(-((2 * h) ** 2) / 2)),
     periodic("sinc", lambda s, h: torch.sin(4 * h) / (4 * h + 9)),
-    periodic("cosines", lambda s, h: torch.cos(3 * h) + s.c.cos(), c=parameter(W)),
 ]
 
 # functions that the router cannot fuse --------------------------------------------------------------------------------
@@ -330,47 +261,15 @@ def clipped(s: Any, x: Tensor) -> dict[str, Tensor]:
     return {"sigma": Clipped.apply(h[..., 0]), "rgb": torch.sigmoid(h[..., 1:])}
 
 
-def by_angles(s: Any, x: Tensor) -> Tensor:
-    x = torch.tanh(x).view(-1, 3, 1).expand(-1, -1, 5)
-    return torch.einsum("bid,iod->bo", torch.cos(torch.acos(0.99 * x) * s.n), s.c)
-
-
-def hyper(s: Any, x: Tensor, z: Tensor) -> Tensor:
-    """Applies a layer whose weights come from the sample's code."""
-    weight, bias = s.m(z).split([W * 3, W], -1)
-    return s.o(torch.relu(torch.bmm(weight.view(-1, W, 3), x.unsqueeze(-1)).squeeze(-1) + bias))
-
-
 TRUNCATED = own("exponential of its own", clipped, ways=BOTH)
-BETWEEN = [
+KINDS["between"] = [
     own("WIRE", wire, b=lambda: nn.Linear(W, W, dtype=torch.cfloat), o=lambda: nn.Linear(W, 3, dtype=torch.cfloat)),
-    own(
-        "polar",
-        lambda s, x: s.o(torch.view_as_real(torch.polar(s.a(x), s.b(x))).flatten(1)),
-        a=(3, 4),
-        b=(3, 4),
-        o=(8, 3),
-    ),
     TRUNCATED,
     own("nan_to_num", lambda s, x: s.o(torch.nan_to_num(s.net(x))), net=mlp(3, 8), o=(8, 4)),
-    own(
-        "bucketize",
-        lambda s, x: s.o(F.relu(s.a(x)) * torch.bucketize(x[:, :1], s.e).float()),
-        e=lambda: torch.linspace(-1, 1, 5),
-    ),
     own("one_hot", lambda s, x, i: s.o(F.relu(s.a(torch.cat([x, F.one_hot(i, 9).to(x)], -1)))), 3, images, a=(12, W)),
-    own(
-        "triangle waves",
-        lambda s, x: s.net(torch.abs(torch.remainder((x[..., None] * s.f).flatten(1), 2) - 1)),
-        f=octaves(3),
-        net=9,
-    ),
     own("H-SIREN", lambda s, x: s.b(torch.sin(torch.sinh(s.a(x)))), b=(W, 4), second=True),
-    own("Chebyshev of angles", by_angles, c=parameter(3, 4, 5), n=lambda: torch.arange(5).float()),
-    own("hypernetwork", hyper, 3, 8, m=(8, 4 * W)),
     own("glu", lambda s, x: s.o(F.glu(s.a(x), -1)), a=(3, 2 * W)),
     own("lerp", lambda s, x: s.o(torch.lerp(s.a(x), s.b(x), 0.3)), b=(3, W)),
-    own("power", lambda s, x: s.o(s.a(x).abs() ** s.e), e=lambda: torch.rand(W) + 1),
     Row("CELU", lambda: fields.Activated(nn.CELU(), 32), (3,)),
     Row("Hardswish", lambda: fields.Activated(nn.Hardswish(), 32), (3,)),
 ]
@@ -378,28 +277,15 @@ BETWEEN = [
 # signed distances -----------------------------------------------------------------------------------------------------
 
 
-def finite(s: Any, x: Tensor) -> Tensor:
-    steps = 1e-1 * torch.eye(3).to(x)
-    return torch.cat([(s.net(x + e) - s.net(x - e)) / 0.2 for e in steps], -1)
-
-
 def geometric(i: int, o: int) -> Callable[[], nn.Module]:
     return mlp(i, o, lambda: nn.Softplus(100))
 
 
-DISTANCES = [
+KINDS["distances"] = [
     Row("NeuS", fields.SignedDistance, (3,), second=True),
-    Row("VolSDF", fields.WeightNormed, (3,)),
     own("softplus", lambda s, x: s.net(x), second=True, net=geometric(3, 5), ways=BOTH),
     own(
         "sphere", lambda s, x: torch.minimum(s.net(x), 3 - x.norm(2, 1, keepdim=True)), second=True, net=geometric(3, 1)
-    ),
-    own("tanh", lambda s, x: torch.tanh(s.net(x)), second=True, net=mlp(3, 1, nn.Tanh)),
-    own(
-        "residual of a sphere",
-        lambda s, x: s.net(x) + x.norm(dim=-1, keepdim=True) - 0.5,
-        second=True,
-        net=geometric(3, 1),
     ),
     own("clamped", lambda s, x: s.net(x).clamp(-0.1, 0.1), net=geometric(3, 1)),
     own("squared ReLU", lambda s, x: s.o(F.relu(s.a(x)) ** 2), second=True, o=(W, 1)),
@@ -410,7 +296,6 @@ DISTANCES = [
         b=number(0.5),
     ),
     own("S-density", lambda s, x: torch.sigmoid(s.net(x) * torch.exp(s.v * 10)), net=geometric(3, 1), v=number(0.1)),
-    own("finite differences", finite, net=geometric(3, 1)),
 ]
 
 
@@ -436,33 +321,19 @@ def curvature(s: Any, x: Tensor) -> Tensor:
     return torch.stack([slope(first[:, i : i + 1], x)[:, i] for i in range(3)]).sum(0)
 
 
-def potential(s: Any, x: Tensor) -> Tensor:
-    """Returns a divergence-free velocity: the curl of a potential."""
-    a = s.net(x)[:, :3]
-    jacobian = [slope(a[:, i : i + 1], x) for i in range(3)]
-    return torch.stack([jacobian[2][:, 1] - jacobian[1][:, 2], jacobian[0][:, 2] - jacobian[2][:, 0]], -1)
-
-
-GRADIENTS = [
+KINDS["gradients"] = [
     inside("slope", lambda s, x: slope(s.net(x)[:, :1], x)),
     inside("slope and value", lambda s, x: (s.net(x), slope(s.net(x)[:, :1], x))),
     inside("of a sum", lambda s, x: torch.autograd.grad(s.net(x)[:, 0].sum(), x, create_graph=True)[0]),
-    inside("unit normals", lambda s, x: F.normalize(slope(s.net(x)[:, :1], x), dim=-1)),
-    inside("negative normals", lambda s, x: -slope(s.net(x)[:, :1], x)[:, None]),
     inside(
         "colour of normals",
         lambda s, x: s.rgb(torch.cat([x, slope(s.net(x)[:, :1], x), s.net(x)[:, 1:]], -1)).sigmoid(),
         rgb=mlp(10, 3),
         ways=GROUPED,
     ),
-    inside(
-        "detached normals", lambda s, x: s.rgb(torch.cat([x, slope(s.net(x)[:, :1], x).detach()], -1)), rgb=mlp(6, 3)
-    ),
     inside("shaded", lambda s, x: s.net(x)[:, 1:4] * slope(s.net(x)[:, :1], x).sum(-1, keepdim=True).clamp(min=0)),
     inside("eikonal", lambda s, x: (slope(s.net(x)[:, :1], x).norm(dim=-1) - 1) ** 2),
     inside("Laplacian", curvature),
-    inside("rotation", potential),
-    inside("sine", lambda s, x: slope(s.net(x)[:, :1], x), net=lambda: fields.Siren(W, 5)),
 ]
 
 # KANs -----------------------------------------------------------------------------------------------------------------
@@ -476,76 +347,52 @@ def chebyshev(s: Any, x: Tensor) -> Tensor:
     return torch.einsum("bid,iod->bo", torch.stack(t, -1), s.c)
 
 
-def fourier(s: Any, x: Tensor) -> Tensor:
-    angles = x.unsqueeze(-1) * s.n
-    return torch.einsum("bik,oik->bo", angles.cos(), s.c) + torch.einsum("bik,oik->bo", angles.sin(), s.d)
-
-
-def radial(s: Any, x: Tensor) -> Tensor:
-    basis = torch.exp(-(((x[..., None] - s.g) / 0.5) ** 2))
-    return s.o(basis.view(len(x), -1)) + s.base(F.silu(x))
-
-
-def wavelet(s: Any, x: Tensor) -> Tensor:
-    """Sums Mexican hat wavelets, one for each pair of input and output."""
-    scaled = (x.unsqueeze(1) - s.shift) / s.scale.exp()
-    return ((scaled**2 - 1) * torch.exp(-0.5 * scaled**2) * s.w).sum(2)
-
-
-KANS = [
+KINDS["kans"] = [
     Row("B-splines", lambda: fields.KAN(16), (3,)),
     own("Chebyshev", chebyshev, c=parameter(3, 4, 5), ways=BOTH),
-    own("Fourier", fourier, c=parameter(4, 3, 5), d=parameter(4, 3, 5), n=lambda: torch.arange(5).float()),
-    own("radial", radial, g=lambda: torch.linspace(-2, 2, 8), o=(24, 4), base=(3, 4)),
-    own("wavelets", wavelet, shift=parameter(4, 3), scale=parameter(4, 3), w=parameter(4, 3)),
-    own(
-        "Taylor",
-        lambda s, x: torch.einsum("bid,oid->bo", torch.stack([x**i for i in range(4)], -1), s.c),
-        c=parameter(4, 3, 4),
-    ),
-    own(
-        "Legendre",
-        lambda s, x: torch.einsum("bid,iod->bo", torch.stack([x, 1.5 * x * x - 0.5], -1), s.c),
-        c=parameter(3, 4, 2),
-    ),
     own("sum of products", lambda s, x: (torch.stack([x, x**2], -1)[:, None] * s.c).sum((2, 3)), c=parameter(4, 3, 2)),
     own("flattened", lambda s, x: torch.stack([x, x**3], -1).flatten(1) @ s.c.flatten(1).T, c=parameter(4, 3, 2)),
-    own("two layers", lambda s, x: s.b(F.silu(s.a(torch.cat([x, x**2, x**3], -1)))), a=(9, W), b=(W, 4)),
-    own(
-        "piecewise linear",
-        lambda s, x: torch.einsum("big,iog->bo", F.relu(1 - (x[..., None] - s.g).abs() * 2), s.c),
-        c=parameter(3, 4, 5),
-        g=lambda: torch.linspace(-1, 1, 5),
+]
+
+# norms ----------------------------------------------------------------------------------------------------------------
+
+
+def normed(norm: Callable[[nn.Module], nn.Module]) -> dict[str, Part]:
+    return {"a": lambda: norm(nn.Linear(3, W)), "b": lambda: norm(nn.Linear(W, W))}
+
+
+def behind(s: Any, x: Tensor) -> Tensor:
+    return s.o(F.relu(s.b(F.relu(s.a(x)))))
+
+
+def between(name: str, call: Callable[..., Tensor], **parts: Part) -> Row:
+    return own(name, lambda s, x: s.o(F.silu(call(s, s.a(x)))), **parts)
+
+
+KINDS["norms"] = [
+    own("weight_norm by hooks", behind, **normed(nn.utils.weight_norm), ways=BOTH),
+    own("weight_norm", behind, **normed(nn.utils.parametrizations.weight_norm), ways=BOTH),
+    between("LayerNorm", lambda s, h: s.n(h), n=lambda: nn.LayerNorm(W), ways=BOTH),
+    between("LayerNorm, bare", lambda s, h: s.n(h), n=lambda: nn.LayerNorm(W, elementwise_affine=False)),
+    between("RMSNorm", lambda s, h: s.n(h), n=lambda: nn.RMSNorm(W)),
+    between(
+        "root of mean squares",
+        lambda s, h: h * torch.rsqrt(h.pow(2).mean(-1, keepdim=True) + 1e-5) * s.g,
+        g=parameter(W),
     ),
+    between("normalize", lambda s, h: F.normalize(h, dim=-1)),
+    between(
+        "standardised",
+        lambda s, h: (h - h.mean(-1, keepdim=True)) / (h.var(-1, keepdim=True, unbiased=False) + 1e-5).sqrt(),
+    ),
+    between("softmax", lambda s, h: F.softmax(h, -1) * h),
 ]
 
 # tables ---------------------------------------------------------------------------------------------------------------
 
 
-def voxels(s: Any, x: Tensor) -> Tensor:
-    found = F.grid_sample(s.grid, x.view(1, -1, 1, 1, 3), align_corners=True, padding_mode="border")
-    return s.net(found.view(4, -1).T)
-
-
-def triplane(s: Any, x: Tensor) -> Tensor:
-    pairs = torch.stack([x[:, [0, 1]], x[:, [0, 2]], x[:, [1, 2]]])[:, :, None]
-    return s.net(F.grid_sample(s.planes, pairs, align_corners=False).squeeze(-1).sum(0).T)
-
-
-def small_grid() -> nn.Module:
-    return GridEncoder(num_levels=3, base_resolution=4)
-
-
-TABLES = [
-    Row("nerfacto", lambda: fields.HashTable(1 << 8, 4), (3,)),
-    Row("HashNeRF", lambda: fields.HashEmbedder(1 << 8, 4), (3,)),
-    Row("torch-ngp", lambda: fields.NeRFNetwork(1 << 8, 4), (3, 3)),
-    Row("TensoRF", lambda: fields.TensorField(8), (3,)),
+KINDS["tables"] = [
     Row("K-Planes", lambda: fields.KPlanes((4, 8)), (3,)),
-    Row("NeRF-W", fields.AppearanceNeRF, (90, images)),
-    own("grid", lambda s, x: s.net(s.grid(x)), grid=small_grid, net=6),
-    own("voxels", voxels, grid=parameter(1, 4, 5, 5, 5), net=4),
-    own("triplane", triplane, planes=parameter(3, 4, 6, 6), net=4),
     own(
         "row by index",
         lambda s, x: s.net(torch.cat([x, s.table[(x[:, 0] > 0).long()]], -1)),
@@ -564,48 +411,6 @@ TABLES = [
     ),
 ]
 
-# norms ----------------------------------------------------------------------------------------------------------------
-
-
-def normed(norm: Callable[[nn.Module], nn.Module]) -> dict[str, Part]:
-    return {"a": lambda: norm(nn.Linear(3, W)), "b": lambda: norm(nn.Linear(W, W))}
-
-
-def behind(s: Any, x: Tensor) -> Tensor:
-    return s.o(F.relu(s.b(F.relu(s.a(x)))))
-
-
-def between(name: str, call: Callable[..., Tensor], **parts: Part) -> Row:
-    return own(name, lambda s, x: s.o(F.silu(call(s, s.a(x)))), **parts)
-
-
-NORMS = [
-    own("weight_norm by hooks", behind, **normed(nn.utils.weight_norm), ways=BOTH),
-    own("weight_norm", behind, **normed(nn.utils.parametrizations.weight_norm), ways=BOTH),
-    own(
-        "of g and v",
-        lambda s, x: s.o(F.relu(F.linear(x, s.g * s.v / s.v.norm(dim=1, keepdim=True)))),
-        g=parameter(W, 1),
-        v=parameter(W, 3),
-    ),
-    Row("ResBlocks", fields.Normed, (3,)),
-    between("LayerNorm", lambda s, h: s.n(h), n=lambda: nn.LayerNorm(W), ways=BOTH),
-    between("LayerNorm, bare", lambda s, h: s.n(h), n=lambda: nn.LayerNorm(W, elementwise_affine=False)),
-    between("layer_norm", lambda s, h: F.layer_norm(h, (W,)) * s.g + s.b, g=parameter(W), b=parameter(W)),
-    between("RMSNorm", lambda s, h: s.n(h), n=lambda: nn.RMSNorm(W)),
-    between(
-        "root of mean squares",
-        lambda s, h: h * torch.rsqrt(h.pow(2).mean(-1, keepdim=True) + 1e-5) * s.g,
-        g=parameter(W),
-    ),
-    between("normalize", lambda s, h: F.normalize(h, dim=-1)),
-    between(
-        "standardised",
-        lambda s, h: (h - h.mean(-1, keepdim=True)) / (h.var(-1, keepdim=True, unbiased=False) + 1e-5).sqrt(),
-    ),
-    between("softmax", lambda s, h: F.softmax(h, -1) * h),
-]
-
 # residual blocks ------------------------------------------------------------------------------------------------------
 
 
@@ -613,26 +418,11 @@ def residual(name: str, call: Callable[..., Tensor], **parts: Part) -> Row:
     return own(name, lambda s, x: s.o(call(s, s.stem(x))), **{"stem": (3, W), "a": (W, W), **parts})
 
 
-def added(s: Any, h: Tensor) -> Tensor:
-    identity = h
-    out = s.b(F.relu(s.a(h)))
-    out += identity
-    return F.relu(out)
-
-
-RESIDUAL = [
-    residual("before", lambda s, h: h + s.b(F.relu(s.a(F.relu(h))))),
+KINDS["residual"] = [
     residual("behind", lambda s, h: F.relu(h + s.b(F.relu(s.a(h))))),
-    residual("in place", added),
-    residual("with a shortcut", lambda s, h: s.c(h) + s.b(F.elu(s.a(h))), c=lambda: nn.Linear(W, W, bias=False)),
     residual("scaled", lambda s, h: h + 0.1 * s.b(F.gelu(s.a(h)))),
-    residual("learned scale", lambda s, h: h + s.g * s.b(F.gelu(s.a(h))), g=parameter(W)),
-    residual("adaptive", lambda s, h: s.t * s.b(F.tanh(s.a(h))) + (1 - s.t) * h, t=number(0.4)),
-    residual("highway", lambda s, h: torch.sigmoid(s.a(h)) * s.b(h) + (1 - torch.sigmoid(s.a(h))) * h),
-    residual("gated", lambda s, h: h + s.a(h) * torch.sigmoid(s.b(h))),
     residual("dense", lambda s, h: s.c(torch.cat([h, s.a(h).relu(), s.b(h).relu()], -1)), c=(3 * W, W)),
     residual("twice the same", lambda s, h: h + s.a(F.relu(s.a(F.relu(h)))) + s.b(h), ways=BOTH),
-    residual("gates of two encoders", lambda s, h: s.a(h) * torch.tanh(h) + (1 - torch.tanh(h)) * s.b(h)),
 ]
 
 # conditions -----------------------------------------------------------------------------------------------------------
@@ -643,26 +433,14 @@ def modulated(s: Any, x: Tensor, z: Tensor) -> Tensor:
     return s.o(torch.sin(gamma * s.a(x) + beta))
 
 
-def of_own_code(s: Any, x: Tensor) -> Tensor:
-    weight = s.m(s.z).view(W, 3)
-    return s.o(torch.relu(x @ weight.T))
-
-
 def low_rank(s: Any, x: Tensor) -> Tensor:
     return s.o(F.relu(F.linear(x, s.w + s.u @ s.v)))
 
 
-CONDITIONS = [
+KINDS["conditions"] = [
     own("code beside the position", lambda s, x, z: s.net(torch.cat([x, z], -1)), 3, 8, net=11),
     own("code of the module", lambda s, x: s.net(torch.cat([x, s.z.expand(len(x), -1)], -1)), z=parameter(1, 5), net=8),
-    own(
-        "repeated code", lambda s, x: s.net(torch.cat([x, s.z[None].repeat(x.shape[0], 1)], -1)), z=parameter(5), net=8
-    ),
     own("FiLM", modulated, 3, 8, m=mlp(8, 2 * W), ways=BOTH),
-    own("added code", lambda s, x, z: s.o(F.relu(s.a(x) + s.b(z))), 3, 8, b=(8, W)),
-    own("SPADE", lambda s, x, z: s.o(F.relu(s.b(z) * s.a(x) + s.c(z))), 3, 8, b=(8, W), c=(8, W)),
-    own("gate", lambda s, x, z: s.o(torch.sigmoid(s.b(z)) * s.a(x)), 3, 8, b=(8, W)),
-    own("hypernetwork of its own code", of_own_code, z=parameter(5), m=(5, 3 * W)),
     own("low rank", low_rank, w=parameter(W, 3), u=parameter(W, 2), v=parameter(2, 3)),
     own("bilinear", lambda s, x, z: torch.einsum("ni,oij,nj->no", x, s.w, z), 3, 4, w=parameter(4, 3, 4)),
     own(
@@ -671,13 +449,6 @@ CONDITIONS = [
         3,
         lambda _: torch.tensor([[0.3]]),
         a=(4, W),
-    ),
-    own(
-        "attention to codes",
-        lambda s, x: F.softmax(s.q(x) @ s.k.T / 3, -1) @ s.v,
-        q=(3, 6),
-        k=parameter(5, 6),
-        v=parameter(5, 4),
     ),
 ]
 
@@ -688,15 +459,12 @@ def raw(name: str, call: Callable[..., Tensor], **more: Any) -> Row:
     return own(name, lambda s, x: s.o(F.relu(call(s, x))), w=parameter(3, W), b=parameter(W), **more)
 
 
-WEIGHTS = [
+KINDS["weights"] = [
     raw("matmul", lambda s, x: x @ s.w + s.b, ways=BOTH),
     raw("linear", lambda s, x: F.linear(x, s.w.t(), s.b), ways=BOTH),
     raw("addmm", lambda s, x: torch.addmm(s.b, x, s.w)),
     raw("einsum", lambda s, x: torch.einsum("...i,io->...o", x, s.w) + s.b),
     raw("mm", lambda s, x: torch.mm(x, s.w).add(s.b)),
-    raw("sum of products", lambda s, x: (x[:, :, None] * s.w).sum(1) + s.b),
-    raw("matmul of a row", lambda s, x: torch.matmul(x[:, None], s.w)[:, 0] + s.b),
-    raw("positive weights", lambda s, x: x @ F.softplus(s.w) + s.b),
     raw("tied", lambda s, x: (x @ s.w) @ s.w.T @ s.w + s.b, ways=BOTH),
     raw("inner and T", lambda s, x: torch.inner(x, s.w.T) + s.b),
     raw("tensordot", lambda s, x: torch.tensordot(x, s.w, dims=1) + s.b),
@@ -709,55 +477,29 @@ def conv(i: int, o: int, kind: Callable[..., nn.Module] = nn.Conv1d, **options: 
     return lambda: kind(i, o, 1, **options)
 
 
-CONVOLUTIONS = [
+KINDS["convolutions"] = [
     own("Conv1d", lambda s, x: s.b(F.relu(s.a(x[..., None]))).squeeze(-1), a=conv(3, W), b=conv(W, 4)),
     own("Conv1d, no bias", lambda s, x: s.o(F.relu(s.a(x.unsqueeze(2))[:, :, 0])), a=conv(3, W, bias=False)),
-    own(
-        "Conv2d",
-        lambda s, x: s.b(F.relu(s.a(x[..., None, None]))).flatten(1),
-        a=conv(3, W, nn.Conv2d),
-        b=conv(W, 4, nn.Conv2d),
-    ),
     own("Conv3d", lambda s, x: s.a(x.view(-1, 3, 1, 1, 1)).view(-1, 4), a=conv(3, 4, nn.Conv3d)),
     own("conv1d", lambda s, x: F.conv1d(x[..., None], s.w, s.b)[..., 0], w=parameter(4, 3, 1), b=parameter(4)),
-    own("conv2d", lambda s, x: F.conv2d(x[..., None, None], s.w)[..., 0, 0], w=parameter(4, 3, 1, 1)),
     own("two in a row", lambda s, x: s.b(s.a(x[..., None])).squeeze(-1), a=conv(3, 8), b=conv(8, 4), ways=BOTH),
-    own("SIREN by Conv1d", lambda s, x: s.b(torch.sin(9 * s.a(x[..., None])))[..., 0], a=conv(3, W), b=conv(W, 4)),
-    own(
-        "with a skip",
-        lambda s, x: s.b(torch.cat([x[..., None], F.relu(s.a(x[..., None]))], 1)).squeeze(2),
-        a=conv(3, W),
-        b=conv(W + 3, 4),
-    ),
-    own(
-        "sequential",
-        lambda s, x: s.net(x[:, :, None]).flatten(1),
-        net=lambda: nn.Sequential(nn.Conv1d(3, W, 1), nn.ReLU(), nn.Conv1d(W, 4, 1)),
-    ),
-    own(
-        "weight_norm",
-        lambda s, x: s.a(x[..., None]).squeeze(-1),
-        a=lambda: nn.utils.parametrizations.weight_norm(nn.Conv1d(3, 4, 1)),
-    ),
-    own("layer behind", lambda s, x: s.o(F.leaky_relu(s.a(x[..., None]), 0.2).mean(-1)), a=conv(3, W)),
 ]
 
 # methods --------------------------------------------------------------------------------------------------------------
 
 
-ASKED = {"forward": 2, "density": 1, "query_density": 1, "query_opacity": 1, "get_density": 1, "sdf": 1}
-ASKED |= {"occupancy": 1, "features": 1, "both": 2}
-METHODS = [Row(name, fields.Heads, (3,) * count, method=name) for name, count in ASKED.items()]
-METHODS += [Row("color", fields.Heads, (3, 3, 4), method="color"), Row("alpha", fields.Heads, (3, 1), method="alpha")]
-METHODS += [Row("warp", fields.Heads, (3, 1), method="warp")]
-METHODS[1:3] = always(*METHODS[1:3])
+KINDS["methods"] = [
+    Row("forward", fields.Heads, (3, 3)),
+    Row("density", fields.Heads, (3,), method="density", ways=BOTH),
+    Row("color", fields.Heads, (3, 3, 4), method="color"),
+]
 
 # samples on other axes, and networks of constants --------------------------------------------------------------------
 
 
 def tokens(name: str, call: Callable[..., Any], *shape: int, **parts: Part) -> Row:
     """Returns the row of a module whose samples have axes of their own, [n, *shape]."""
-    return replace(own(name, call, lambda lead: uniform(lead, *shape), **parts), coords=inner)
+    return replace(own(name, call, of(*shape), **parts), coords=inner)
 
 
 def heads_in_front(s: Any, x: Tensor, between: Callable[[Tensor], Tensor] = lambda q: q) -> Tensor:
@@ -778,12 +520,6 @@ def causal(s: Any, x: Tensor) -> Tensor:
     q, k, v = (part.view(n, t, 2, c // 2).transpose(1, 2) for part in s.qkv(x).split(c, dim=2))
     y = F.scaled_dot_product_attention(q, k, v, is_causal=True)
     return x + s.out(y.transpose(1, 2).contiguous().view(n, t, c))
-
-
-def widths(s: Any, x: Tensor) -> Tensor:
-    """Computes a hidden layer of one unit for each of W networks, which are the first axis."""
-    h = torch.tanh(torch.matmul(x.unsqueeze(0).repeat(W, 1, 1), s.w) + s.c)
-    return torch.matmul(h, s.u).mean(0)
 
 
 def of_the_time(s: Any, x: Tensor, t: Tensor) -> Tensor:
@@ -837,16 +573,13 @@ def at_noon(_: tuple[int, ...]) -> Tensor:
 
 
 SQUARE: dict[str, Part] = {name: parameter(8, 8) for name in "qkv"}
-AXES = [
+KINDS["axes"] = [
     tokens("heads in front", heads_in_front, 5, 8, **SQUARE, ways=BOTH),
     tokens("heads in the batch", heads_in_the_batch, 5, 3, k=(3, W), v=(3, W)),
     tokens("causal attention", causal, 6, 16, qkv=(16, 48), out=(16, 16)),
-    tokens("tensordot", lambda s, x: torch.tanh(torch.tensordot(x, s.w, dims=([-1], [0]))), 5, 3, w=parameter(3, W)),
     own("turned between", lambda s, x: s.b(torch.cosh(s.a(x).t()).t()), a=(3, 64), b=(64, 2), ways=BOTH),
     own("weights in front", lambda s, x: s.o(torch.relu(s.w @ x.t()).t()), w=parameter(W, 3), ways=GROUPED),
     own("weights before columns", lambda s, x: s.o(torch.matmul(s.w, x[..., None]).squeeze(-1)), w=parameter(W, 3)),
-    own("weights of heads", lambda s, x: s.o(torch.relu(x @ s.w).mean(0)), w=parameter(6, 3, W)),
-    own("networks in front", widths, w=parameter(W, 3, 1), c=parameter(W, 1, 1), u=parameter(W, 1, 2)),
     *(
         own(f"trunk of {n} sensors", deeponet, trunk=(2, W), sensors=buffer(n, 2), c=number(0.1), ways=BOTH)
         for n in (1, 16, 37)
@@ -860,7 +593,6 @@ AXES = [
         for t, heads in ((1, 2), (3, 1), (33, 2))
     ),
     own("layer of the time", of_the_time, 3, at_noon, m=mlp(1, 4 * W, nn.Tanh)),
-    own("layer of a constant", lambda s, x: s.o(torch.relu(x @ s.m(torch.eye(3)))), m=(3, W)),
     own("masked weights", lambda s, x: s.o(F.linear(x, s.w * s.mask)), w=parameter(W, 3), mask=buffer(W, 3), ways=BOTH),
 ]
 
@@ -869,11 +601,6 @@ AXES = [
 
 def evaluating(row: Row) -> Row:
     return replace(row, make=lambda: evaluated(row.make()))
-
-
-def stepped(s: Any, x: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    h, c = s.cell(x, (h, c))
-    return s.o(h), c
 
 
 CELLS: dict[str, Part] = {
@@ -909,29 +636,13 @@ def tensordot(s: Any, x: Tensor, z: Tensor) -> Tensor:
     return s.o(torch.tensordot(x[:, :, None] * z[:, None], s.n.weight, ([1, 2], [1, 2])) + s.n.bias)
 
 
-def with_states(s: Any, x: Tensor) -> Tensor:
-    zeros = torch.zeros(2, x.size(0), W)
-    return s.o(s.r(x, (zeros, zeros))[0][:, -1, :])
-
-
 def attended(s: Any, x: Tensor) -> Tensor:
     h = s.a(x)
     return s.o(h + s.m(h, h, h)[0])
 
 
-LAYERS = [
+KINDS["layers"] = [
     evaluating(between("BatchNorm in eval", lambda s, h: s.n(h), n=lambda: nn.BatchNorm1d(W), ways=BOTH)),
-    evaluating(
-        tokens(
-            "BatchNorm2d in eval",
-            lambda s, x: s.n(s.c(x)),
-            3,
-            5,
-            5,
-            c=conv(3, 4, nn.Conv2d),
-            n=lambda: nn.BatchNorm2d(4),
-        )
-    ),
     evaluating(between("Dropout in eval", lambda s, h: s.n(h), n=lambda: nn.Dropout(0.5))),
     between("PReLU", lambda s, h: s.n(h), n=nn.PReLU, ways=BOTH),
     channels("PReLU", lambda: nn.PReLU(4), 4, 6),
@@ -944,8 +655,6 @@ LAYERS = [
     own("bilinear", lambda s, x, z: s.o(F.bilinear(x, z, s.w)), 3, 4, w=parameter(W, 3, 4), ways=BOTH),
     tokens("GRU", lambda s, x: s.o(s.r(x)[0][:, -1]), 5, 3, r=lambda: nn.GRU(3, W, batch_first=True), ways=GROUPED),
     tokens("LSTM", lambda s, x: s.o(s.r(x)[0]), 5, 3, r=lambda: nn.LSTM(3, W, batch_first=True), ways=GROUPED),
-    tokens("LSTM with states", with_states, 5, 3, r=lambda: nn.LSTM(3, W, 2, batch_first=True)),
-    own("LSTMCell", stepped, 3, W, W, cell=lambda: nn.LSTMCell(3, W)),
     own("recurrent cells", cells, 3, W, ways=BOTH, **CELLS),
     series("LSTM of two layers in both directions", nn.LSTM, num_layers=2, bidirectional=True),
     series("RNN without biases", nn.RNN, bias=False, nonlinearity="relu"),
@@ -1003,10 +712,9 @@ def frozen(s: Any, x: Tensor) -> Tensor:
     return s.o(F.relu(s.b(h)))
 
 
-STATE = [
+KINDS["state"] = [
     hidden("layers in a list", lambda a, b: [a, b], lambda kept, x: kept[1](F.relu(kept[0](x)))),
     hidden("layers in a dict", lambda a, b: {"a": a, "b": b}, lambda kept, x: kept["b"](F.relu(kept["a"](x)))),
-    hidden("layers in an object", lambda a, b: SimpleNamespace(a=a, b=b), lambda kept, x: kept.b(F.relu(kept.a(x)))),
     own("results in a dict", keeps, outputs=dict, ways=GROUPED),
     own("results as attributes", kept),
     own("counted steps", annealed, step=lambda: 100),
@@ -1081,21 +789,21 @@ with warnings.catch_warnings():  # TorchScript is deprecated, but old code uses 
     scripted = torch.jit.script(squareplus)  # function modes do not see its operations
 
 
-CALLS = always(
+KINDS["calls"] = always(
     own("heads in a dict", in_a_dict, heads=heads),
     own("flags, near", steered, 7, near=(7, W), far=(3, W), keywords={"scale": 2.0}),
     own("flags, far", steered, 7, "far", near=(7, W), far=(3, W), keywords={"extra": W}),
     own("written in place", written, bands=octaves(2), fc=(12, 12), film=(12, 24), out=(12, 4)),
     ways=GROUPED,
 )
-CALLS += always(
+KINDS["calls"] += always(
     own("samples in a box", in_a_box),
     own("samples in order", in_order),
     own("scripted", lambda s, x: s.o(scripted(s.a(x), 4.0))),
     own("checkpoint", lambda s, x: s.o(checkpoint(s.block, x, use_reentrant=False)), block=mlp(3, W)),
     ways=BY_CELL,
 )
-CALLS += always(Row("table", lambda: NeRF(width=10, depth=3, skips=(1,)), (3, 3)), ways=("fused",))
+KINDS["calls"] += always(Row("table", lambda: NeRF(width=10, depth=3, skips=(1,)), (3, 3)), ways=("fused",))
 
 # arguments per sample, per ray or for all samples, also in containers and objects -------------------------------------
 
@@ -1150,19 +858,15 @@ def samples_of(lead: tuple[int, ...]) -> Samples:
     return Samples(frustums, torch.randint(4, (*lead, 1)), metadata={"none": None})
 
 
-def per_ray(*shape: int) -> Callable[[tuple[int, ...]], Tensor]:
-    return lambda lead: uniform(lead[:1], *shape)
-
-
 OF_RAYS = {"code": per_ray(5), "time": per_ray()}
-ARGUMENTS = always(
+KINDS["arguments"] = always(
     Row("rows of rays", CodePerRay, (3, per_ray(1, 3)), keywords=OF_RAYS, lead=RAYS),
     replace(
         Row("named rows of rays", CodePerRay, (3, per_ray(1, 3)), keywords=OF_RAYS, lead=RAYS),
         options={"per_ray": ["d", "code", "time"]},
     ),
 )
-ARGUMENTS += always(
+KINDS["arguments"] += always(
     replace(
         own("objects", takes_samples, samples_of, table=lambda: nn.Embedding(4, 2), fc=(8, 3)),
         coords=positions_of,
@@ -1472,13 +1176,7 @@ EXAMPLES = PYTORCH + always(
     Row("mipnerf_pl", mip_field, (12, per_ray(9)), lead=RAYS, options={"per_ray": ["view_direction"]}),
     Row("mipnerf_pl without views", mip_field, (12,), lead=RAYS),
     Row("nerfacc", nerfacc_field, (3, 3)),
-    Row(
-        "nerfacc with a condition per ray",
-        nerfacc_field,
-        (3, per_ray(3)),
-        lead=RAYS,
-        options={"per_ray": ["condition"]},
-    ),
+    Row("nerfacc, condition per ray", nerfacc_field, (3, per_ray(3)), lead=RAYS, options={"per_ray": ["condition"]}),
     Row("nerfacc query_density", nerfacc_field, method="query_density"),
     Row("nerfacc query_opacity", nerfacc_field, (3, 0.01), method="query_opacity"),
     Row("torch-ngp color", ngp_field, (3, 3), "color", {"geo_feat": 4}),
@@ -1500,32 +1198,7 @@ EXAMPLES += always(
     ways=BY_CELL,  # the module selects rows
 )
 
-KINDS = {
-    "plain": PLAIN,
-    "encodings": ENCODINGS,
-    "outputs": OUTPUTS,
-    "activations": ACTIVATIONS,
-    "periodic": PERIODIC,
-    "distances": DISTANCES,
-    "kans": KANS,
-    "norms": NORMS,
-    "residual": RESIDUAL,
-    "conditions": CONDITIONS,
-    "weights": WEIGHTS,
-    "convolutions": CONVOLUTIONS,
-    "methods": METHODS,
-    "gradients": GRADIENTS,
-    "tables": TABLES,
-    "between": BETWEEN,
-    "axes": AXES,
-    "layers": LAYERS,
-    "state": STATE,
-    "calls": CALLS,
-    "arguments": ARGUMENTS,
-    "rules": RULES,
-    "shared": SHARED,
-    "examples": EXAMPLES,
-}
+KINDS |= {"rules": RULES, "shared": SHARED, "examples": EXAMPLES}
 IN_RUNS = ("gradients", "tables", "between")
 """The kinds whose modules are only partly fused: PyTorch computes functions between the fused parts."""
 IN_ANY_WAY = ("axes", "layers", "state", "calls", "arguments", "rules", "shared", "examples")

@@ -11,23 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ops.foreign_rows import Row, evaluated, inner, uniform
+from ops.foreign_rows import Row, evaluated, inner, numbers, of, per_ray, uniform
 
 Lead = tuple[int, ...]
 RAYS = (70, 5)
 BOX = [-1.0, -1.0, -1.0, 1.0, 1.0, 1.0]
 SDF = {"skip_in": (2,), "multires": 6}
 WIDE = [64] * 4
-
-
-def per_ray(features: int) -> Any:
-    """Returns a function that makes a row of features for each ray."""
-    return lambda lead: uniform(lead[:1], features)
-
-
-def images(lead: Lead) -> Tensor:
-    """Returns an image number for each sample."""
-    return torch.randint(0, 100, lead)
 
 
 def in_a_dict(**sizes: int) -> Any:
@@ -42,7 +32,7 @@ def coords_of(key: str) -> Any:
 
 def with_image(features: int) -> Any:
     """Returns a function that makes features whose last column is an image number."""
-    return lambda lead: torch.cat([uniform(lead, features), images(lead)[..., None]], -1)
+    return lambda lead: torch.cat([uniform(lead, features), numbers(100, 1)(lead)], -1)
 
 
 class Unbatched(nn.Module):
@@ -56,19 +46,9 @@ class Unbatched(nn.Module):
         return self.net(x[None])[0]
 
 
-def of(*shape: int) -> Any:
-    """Returns a function that makes a tensor of a shape for each sample."""
-    return lambda lead: uniform(lead, *shape)
-
-
 def pair(*sizes: int) -> Any:
     """Returns a function that makes a tuple of tensors."""
     return lambda lead: tuple(uniform(lead, size) for size in sizes)
-
-
-def numbers(bound: int, *shape: int) -> Any:
-    """Returns a function that makes whole numbers below a bound for each sample."""
-    return lambda lead: torch.randint(0, bound, (*lead, *shape))
 
 
 class OfSensors(nn.Module):
@@ -275,6 +255,19 @@ def rendering(m: Any) -> nn.Module:
     return m.RenderingNetwork(64, "idr", 9, 3, WIDE, multires_view=4)
 
 
+NORMED = {"norm_layers": (0, 1, 2, 3)}
+BEHIND = {"coords": lambda x: x[:, -3:]}  # positions behind a code
+
+
+def decoder(m: Any, **more: Any) -> nn.Module:
+    """Makes the decoder of DeepSDF and SAL."""
+    return m.Decoder(32, WIDE, latent_in=[2], **more)
+
+
+def vanilla(m: Any) -> nn.Module:
+    return m.VanillaNeRFRadianceField(8, 64, 4, 1, 32)
+
+
 def skips(m: Any, **more: Any) -> nn.Module:
     """Makes the network of nerf-pytorch and its descendants."""
     return m.NeRF(8, 64, 63, 27, use_viewdirs=True, **more)
@@ -286,14 +279,8 @@ MEGA = {"pos_xyz_dim": 10, "pos_dir_dim": 4, "layers": 8, "skip_layers": [4], "l
 
 
 def mega(appearance: int) -> Any:
-    return lambda m: m.NeRF(
-        **MEGA,
-        appearance_dim=appearance,
-        affine_appearance=False,
-        appearance_count=100,
-        xyz_dim=3,
-        sigma_activation=m.ShiftedSoftplus(),
-    )
+    sizes = {**MEGA, "appearance_dim": appearance, "appearance_count": 100, "affine_appearance": False, "xyz_dim": 3}
+    return lambda m: m.NeRF(**sizes, sigma_activation=m.ShiftedSoftplus())
 
 
 PUBLIC: dict[str, list[Row]] = {
@@ -315,13 +302,8 @@ PUBLIC: dict[str, list[Row]] = {
         Row("MLP", lambda m: m.MLP(8, 64, 1, 32, 4, 3, 1, "relu", 96, 27), (96, per_ray(27)), lead=RAYS)
     ],
     "nerfstudio-project/nerfacc/examples:radiance_fields.mlp": [
-        Row("VanillaNeRFRadianceField", lambda m: m.VanillaNeRFRadianceField(8, 64, 4, 1, 32), (3, 3)),
-        Row(
-            "VanillaNeRFRadianceField.query_density",
-            lambda m: m.VanillaNeRFRadianceField(8, 64, 4, 1, 32),
-            (3,),
-            method="query_density",
-        ),
+        Row("VanillaNeRFRadianceField", vanilla, (3, 3)),
+        Row("VanillaNeRFRadianceField.query_density", vanilla, (3,), method="query_density"),
         Row("TNeRFRadianceField", lambda m: m.TNeRFRadianceField(), (3, 1, 3)),
         Row("NDRTNeRFRadianceField", lambda m: m.NDRTNeRFRadianceField(), (3, 1, 3)),
     ],
@@ -468,7 +450,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row(
             "MLP",
             zipnerf,
-            (False, lambda lead: uniform(lead, 6, 3), lambda lead: torch.rand(*lead, 6), per_ray(3)),
+            (False, of(6, 3), lambda lead: torch.rand(*lead, 6), per_ray(3)),
             coords=lambda rand, means, *_, **__: means.mean(-2),
             lead=RAYS,
         )
@@ -477,32 +459,16 @@ PUBLIC: dict[str, list[Row]] = {
         Row("ImplicitNet", lambda m: m.ImplicitNet(3, WIDE, skip_in=[2]), (3,), second=True)
     ],
     "facebookresearch/DeepSDF:networks.deep_sdf_decoder": [
-        Row(
-            "Decoder",
-            lambda m: m.Decoder(32, WIDE, norm_layers=(0, 1, 2, 3), latent_in=[2], weight_norm=True),
-            (35,),
-            coords=lambda x: x[:, -3:],
-        ),
-        Row(
-            "Decoder, LayerNorm",
-            lambda m: m.Decoder(32, WIDE, norm_layers=(0, 1, 2, 3), latent_in=[2]),
-            (35,),
-            coords=lambda x: x[:, -3:],
-        ),
+        Row("Decoder", lambda m: decoder(m, **NORMED, weight_norm=True), (35,), **BEHIND),
+        Row("Decoder, LayerNorm", lambda m: decoder(m, **NORMED), (35,), **BEHIND),
     ],
     "matanatz/SAL/code:model.network": [
-        Row(
-            "Decoder",
-            lambda m: m.Decoder(32, WIDE, dropout=(), latent_in=[2], activation="torch.nn.Tanh"),
-            (35,),
-            coords=lambda x: x[:, -3:],
-        )
+        Row("Decoder", lambda m: decoder(m, dropout=(), activation="torch.nn.Tanh"), (35,), **BEHIND)
     ],
     "apchenstu/TensoRF:models.tensorBase": [
         Row("MLPRender_Fea", lambda m: m.MLPRender_Fea(27, featureC=64), (3, 3, 27)),
-        Row(
-            "MLPRender_PE", lambda m: m.MLPRender_PE(27, featureC=64), (3, 3, 30)
-        ),  # its first layer has three more inputs
+        # The first layer has three more inputs.
+        Row("MLPRender_PE", lambda m: m.MLPRender_PE(27, featureC=64), (3, 3, 30)),
         Row("MLPRender", lambda m: m.MLPRender(27, featureC=64), (3, 3, 27)),
     ],
     "apchenstu/TensoRF:models.tensoRF": [
@@ -510,10 +476,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row("TensorCP.compute_appfeature", lambda m: tensorf(m, "TensorCP"), (3,), method="compute_appfeature"),
         Row("TensorVMSplit.compute_densityfeature", tensorf, (3,), method="compute_densityfeature"),
     ],
-    "apple/ml-neuman:models.vanilla": [
-        Row("Joiner(NeRF)", joined, (3, 3)),
-        Row("OffsetNet", offsets, (4,)),
-    ],
+    "apple/ml-neuman:models.vanilla": [Row("Joiner(NeRF)", joined, (3, 3)), Row("OffsetNet", offsets, (4,))],
     "ashawkey/torch-ngp:nerf.network": [
         Row("NeRFNetwork", lambda m: m.NeRFNetwork(), (3, 3)),
         Row("NeRFNetwork (frequency)", lambda m: m.NeRFNetwork("frequency", "frequency"), (3, 3)),
@@ -599,7 +562,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row(
             "IBRNet",
             ibrnet,
-            (lambda lead: uniform(lead, 3, 35), lambda lead: uniform(lead, 3, 4), lambda lead: torch.ones(*lead, 3, 1)),
+            (of(3, 35), of(3, 4), lambda lead: torch.ones(*lead, 3, 1)),
             coords=lambda features, *_, **__: features[..., 0, :3],
             lead=RAYS,
         )
@@ -620,13 +583,13 @@ PUBLIC: dict[str, list[Row]] = {
         ),
     ],
     "shenweichen/DeepCTR-Torch:deepctr_torch.layers.core": [
-        Row("DNN, BatchNorm in eval", lambda m: evaluated(m.DNN(9, [32, 16], use_bn=True, init_std=0.3)), (9,)),
+        Row("DNN, BatchNorm in eval", lambda m: evaluated(m.DNN(9, [32, 16], use_bn=True, init_std=0.3)), (9,))
     ],
     "shenweichen/DeepCTR-Torch:deepctr_torch.layers.activation": [
         Row("Dice in eval", lambda m: evaluated(m.Dice(9)), (9,))
     ],
     "shenweichen/DeepCTR-Torch:deepctr_torch.layers.sequence": [
-        Row("AUGRUCell", lambda m: drawn(m.AUGRUCell(6, 8)), (6, 8, 1)),
+        Row("AUGRUCell", lambda m: drawn(m.AUGRUCell(6, 8)), (6, 8, 1))
     ],
     "rtqichen/ffjord/lib/layers:diffeq_layers.basic": [
         Row("ConcatSquashLinear", lambda m: m.ConcatSquashLinear(3, 16), (moment, 3), coords=after_the_time),
@@ -638,7 +601,7 @@ PUBLIC: dict[str, list[Row]] = {
             lambda m: m.ODEnet((32, 32), (3,), None, False, "concatsquash"),
             (moment, 3),
             coords=after_the_time,
-        ),
+        )
     ],
     "rtqichen/ffjord/lib/layers:coupling": [Row("CouplingLayer", lambda m: m.CouplingLayer(4), (4,))],
     "rtqichen/torchdiffeq/examples:cnf": [
@@ -652,11 +615,7 @@ PUBLIC: dict[str, list[Row]] = {
     ],
     "bayesiains/nflows:nflows.nn.nets.resnet": [
         Row("ResidualNet with context", lambda m: m.ResidualNet(4, 6, 24, 3), (4, 3)),
-        Row(
-            "ResidualNet, BatchNorm in eval",
-            lambda m: evaluated(m.ResidualNet(4, 6, 24, use_batch_norm=True)),
-            (4,),
-        ),
+        Row("ResidualNet, BatchNorm in eval", lambda m: evaluated(m.ResidualNet(4, 6, 24, use_batch_norm=True)), (4,)),
     ],
     "ikostrikov/pytorch-flows:flows": [
         Row("MADE", lambda m: m.MADE(4, 16), (4,)),
@@ -680,10 +639,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row("GenericBlock", lambda m: m.GenericBlock(32, 4, "cpu"), (10,)),
     ],
     "ServiceNow/N-BEATS:models.nbeats": [Row("NBeats", nbeats, (10, lambda lead: torch.ones(*lead, 10)))],
-    "karpathy/nanoGPT:model": [
-        Row("Block", gpt, (of(6, 24),), **INNER),
-        Row("MLP", lambda m: gpt(m).mlp, (24,)),
-    ],
+    "karpathy/nanoGPT:model": [Row("Block", gpt, (of(6, 24),), **INNER), Row("MLP", lambda m: gpt(m).mlp, (24,))],
     "karpathy/minGPT:mingpt.model": [
         Row("Block", gpt, (of(6, 24),), **INNER),
         Row("CausalSelfAttention", lambda m: gpt(m).attn, (of(6, 24),), **INNER),
@@ -713,11 +669,7 @@ PUBLIC: dict[str, list[Row]] = {
     "thuml/Time-Series-Library:models.TiDE": [Row("ResBlock", lambda m: m.ResBlock(9, 16, 8, 0.0), (9,))],
     "cure-lab/LTSF-Linear:models.NLinear": [Row("NLinear", series, (of(12, 3),), **INNER)],
     "sktime/pytorch-forecasting/pytorch_forecasting/models/temporal_fusion_transformer:sub_modules": [
-        Row(
-            "GatedResidualNetwork",
-            lambda m: m.GatedResidualNetwork(6, 16, 8, 0.0, context_size=5),
-            (6, 5),
-        )
+        Row("GatedResidualNetwork", lambda m: m.GatedResidualNetwork(6, 16, 8, 0.0, context_size=5), (6, 5))
     ],
     "locuslab/TCN:TCN.tcn": [
         Row("TemporalConvNet", lambda m: m.TemporalConvNet(3, [8, 8]).eval(), (of(3, 12),), **INNER)
@@ -745,9 +697,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row("Critic", lambda m: m.Critic(8, 3), (8, 3)),
         Row("Critic.Q1", lambda m: m.Critic(8, 3), (8, 3), method="Q1"),
     ],
-    "pranz24/pytorch-soft-actor-critic:model": [
-        Row("GaussianPolicy", lambda m: m.GaussianPolicy(8, 3, 32), (8,)),
-    ],
+    "pranz24/pytorch-soft-actor-critic:model": [Row("GaussianPolicy", lambda m: m.GaussianPolicy(8, 3, 32), (8,))],
     "openai/spinningup/spinup/algos/pytorch/td3:core": [
         Row("MLPQFunction", lambda m: m.MLPQFunction(8, 3, (32, 32), nn.ReLU), (8, 3))
     ],
@@ -772,7 +722,7 @@ PUBLIC: dict[str, list[Row]] = {
         Row("FeatTransformer in eval", lambda m: evaluated(m.FeatTransformer(9, 8, None, 2)), (9,))
     ],
     "greydanus/hamiltonian-nn:hnn": [
-        Row("HNN.time_derivative", lambda m: m.HNN(4, m.MLP(4, 32, 2)), (4,), method="time_derivative"),
+        Row("HNN.time_derivative", lambda m: m.HNN(4, m.MLP(4, 32, 2)), (4,), method="time_derivative")
     ],
     "tanelp/tiny-diffusion:ddpm": [Row("MLP", lambda m: m.MLP(32, 2, 16), (2, numbers(50)))],
     "tkipf/c-swm:modules": [

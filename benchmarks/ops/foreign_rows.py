@@ -15,7 +15,7 @@ import math
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,10 +32,7 @@ LARGEST = 69
 SIZES = range(1, LARGEST + 1)
 """The batch sizes at which values are compared: the number of samples, or of rays. Sizes of a module's tensors up to
 ``LARGEST`` are compared, too."""
-WAYS: dict[str, dict[str, Any]] = {
-    "fused": {"fuse": True},
-    "grouped": {"way": "grouped"},
-}
+WAYS: dict[str, dict[str, Any]] = {"fused": {"fuse": True}, "grouped": {"way": "grouped"}}
 """The options of the routers that are compared at all of :data:`SIZES`."""
 TIMED: dict[str, dict[str, Any]] = {**WAYS, "cell by cell": {"way": "loop"}}
 """The options of the routers that are timed."""
@@ -84,6 +81,21 @@ def uniform(lead: tuple[int, ...], *shape: int) -> Tensor:
     return torch.rand(*lead, *shape) * 2 - 1
 
 
+def of(*shape: int) -> Callable[[tuple[int, ...]], Tensor]:
+    """Returns a function that makes a tensor of a shape for each sample."""
+    return lambda lead: uniform(lead, *shape)
+
+
+def per_ray(*shape: int) -> Callable[[tuple[int, ...]], Tensor]:
+    """Returns a function that makes a tensor of a shape for each ray."""
+    return lambda lead: uniform(lead[:1], *shape)
+
+
+def numbers(bound: int, *shape: int) -> Callable[[tuple[int, ...]], Tensor]:
+    """Returns a function that makes whole numbers below a bound for each sample."""
+    return lambda lead: torch.randint(0, bound, (*lead, *shape))
+
+
 def inner(x: Tensor, *_: Any, **__: Any) -> Tensor:
     """Returns the first three features of each sample, for samples with axes of their own."""
     return x.flatten(1)[:, :3]
@@ -96,6 +108,20 @@ def evaluated(module: nn.Module) -> nn.Module:
             layer.running_mean.normal_()
             layer.running_var.uniform_(0.5, 2)
     return module.eval()
+
+
+def shared_names(module: nn.Module, patterns: Sequence[str]) -> list[str]:
+    """Returns the names of a module's parameters that match one of the patterns."""
+    names = [name for name, _ in module.named_parameters()]
+    return [name for name in names if any(fnmatch.fnmatch(name, pattern) for pattern in patterns)]
+
+
+def share(module: nn.Module, first: nn.Module, names: Sequence[str]) -> nn.Module:
+    """Replaces the named parameters of ``module`` by the parameters of ``first`` with the same names."""
+    for name in names:
+        path, _, last = name.rpartition(".")
+        module.get_submodule(path).register_parameter(last, first.get_parameter(name))
+    return module
 
 
 @dataclass(frozen=True)
@@ -155,15 +181,12 @@ class Row:
             with torch.no_grad():
                 for parameter in filter(lambda p: p.requires_grad, module.parameters()):
                     parameter += 0.1 * torch.randn_like(parameter) * parameter.abs().mean().clamp(0.01)
-            for name in self.shared(modules[0]):
-                path, _, last = name.rpartition(".")
-                module.get_submodule(path).register_parameter(last, modules[0].get_parameter(name))
+            share(module, modules[0], self.shared(modules[0]))
         return modules
 
     def shared(self, module: nn.Module) -> list[str]:
         """Returns the names of the parameters that all cells have in common."""
-        patterns, names = self.options.get("share", ()), [name for name, _ in module.named_parameters()]
-        return [name for name in names if any(fnmatch.fnmatch(name, pattern) for pattern in patterns)]
+        return shared_names(module, self.options.get("share", ()))
 
     def part(self, value: Tensor, rows: Tensor) -> Tensor:
         """Returns an argument's rows for some samples, as the router does; rows of rays are repeated per sample."""

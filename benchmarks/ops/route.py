@@ -15,25 +15,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ops.alternatives import PIECE, evaluate, join, row_pieces, torch_linear
+from ops.alternatives import PIECE, Parameters, evaluate, join, row_pieces
 from ops.case import BACKWARD, Contender, Work, uniform_points
 from ops.cases_lookup import LOOKUPS
 from ops.networks import NETS, Batch, cost, make_batch, network_error, with_gradients
 from voronerf import ops
-from voronerf.ops._core.layers import MLP
 
 FEW = 1 << 10
 """The largest number of samples for which parameters are gathered per sample."""
 
 
 def route_work(
-    name: str,
-    n: int,
-    k: int,
-    dtype: torch.dtype,
-    direction: str,
-    tolerance: float,
-    device: torch.device,
+    name: str, n: int, k: int, dtype: torch.dtype, direction: str, tolerance: float, device: torch.device
 ) -> Work:
     """Builds the case of a network from ``NETS``."""
     net, centres = NETS[name], uniform_points(k, 1000, device)
@@ -111,25 +104,6 @@ def synchronise(points: Tensor) -> None:
         torch.cuda.synchronize(points.device)
 
 
-class Parameters:
-    """The leaf tensors of each cell in a dtype, for one contender."""
-
-    def __init__(self, batch: Batch, dtype: torch.dtype) -> None:
-        self.count, self.k, training = len(batch.weights), batch.k, batch.direction == BACKWARD
-        tensors = [tensor.detach().to(dtype) for tensor in batch.parameters]
-        per_cell = [[part.clone().requires_grad_(training) for part in tensor.unbind()] for tensor in tensors]
-        self.leaves = [leaf for parts in per_cell for leaf in parts]
-        self.cells = list(zip(*per_cell))
-
-    def network(self, net: MLP, cell: int, x: Tensor, d: Tensor | None) -> Tensor:
-        own = self.cells[cell]
-        return join(evaluate(net, x, d, own[: self.count], own[self.count :], torch_linear))
-
-    def stack(self, found: tuple[Tensor | None, ...]) -> list[Tensor]:
-        full = [torch.zeros_like(leaf) if one is None else one for leaf, one in zip(self.leaves, found)]
-        return [torch.stack(full[at : at + self.k]) for at in range(0, len(full), self.k)]
-
-
 def torch_encode(x: Tensor, octaves: int, dtype: torch.dtype) -> Tensor:
     """Encodes all octaves at once: the input, then a sine and a cosine block for each octave."""
     angles = x[:, None, None, :] * (2.0 ** torch.arange(octaves, device=x.device))[None, :, None, None]
@@ -150,7 +124,8 @@ def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | 
 
 def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
     """Returns a loop over sorted cells: sorts by the narrowest dtype, runs each cell, scatters the results."""
-    lookup, own, net = find(), Parameters(batch, dtype), batch.net
+    lookup, own = find(), Parameters(batch, dtype)
+    cells, octaves = own.cells(), batch.net.position_octaves or 0
     key = torch.uint8 if batch.k <= 256 else torch.int16
     bounds = torch.arange(batch.k + 1, device=batch.positions[0].device)
 
@@ -160,26 +135,26 @@ def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece
         edges = torch.searchsorted(keys.int(), bounds).tolist()
         for cell, first, last in row_pieces(edges, piece):
             rows = order[first:last]
-            x = torch_encode(points[rows], net.position_octaves or 0, dtype)
-            yield rows, own.network(net, cell, x, _of_rows(batch, directions, rows))
+            x = torch_encode(points[rows], octaves, dtype)
+            yield rows, own.network(cells[cell], x, _of_rows(batch, directions, rows))
 
     return _contender(batch, parts, own, dtype)
 
 
 def masked_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
     """Returns a loop over boolean masks of the cells, as in Mega-NeRF's code."""
-    lookup, own, net = find(), Parameters(batch, dtype), batch.net
+    lookup, own = find(), Parameters(batch, dtype)
+    cells, octaves = own.cells(), batch.net.position_octaves or 0
 
     def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
         points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
-        cells = torch.as_tensor(lookup(points))
-        for cell in range(batch.k):
-            mask = cells == cell
+        located = torch.as_tensor(lookup(points))
+        for number, cell in enumerate(cells):
+            mask = located == number
             x = points[mask]
             if x.shape[0] == 0:
                 continue
-            encoded = torch_encode(x, net.position_octaves or 0, dtype)
-            yield mask, own.network(net, cell, encoded, _of_rows(batch, directions, mask))
+            yield mask, own.network(cell, torch_encode(x, octaves, dtype), _of_rows(batch, directions, mask))
 
     return _contender(batch, parts, own, dtype)
 

@@ -246,11 +246,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "split-kinds": Experiment(
         "figure",
         "Centres balanced by importance, drawn from the samples, or on a grid over them.",
-        _changed(
-            (BALANCED, {}),
-            (RANDOM, {"centres": "random"}),
-            (UNIFORM, {"centres": "uniform"}),
-        ),
+        _changed((BALANCED, {}), (RANDOM, {"centres": "random"}), (UNIFORM, {"centres": "uniform"})),
     ),
     "early-late": Experiment("figure", "The time of the split, as a share of the run.", _early_late_variants),
     "cell-count": Experiment(

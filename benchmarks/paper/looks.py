@@ -1,7 +1,6 @@
 """Snapshots of a training ("looks"): a held-out view, a slice of the density, the cells.
 
-A look is a file looks/NAME.npz of a run directory. NAME is "before" or "after" (the first split), "at-25", "at-50"
-or "at-75" (the percentage of the run), or "end".
+A look is a file looks/NAME.npz of a run directory. NAME is "before" or "after" (the first split), or "end".
 """
 
 from __future__ import annotations
@@ -26,18 +25,16 @@ VERSION = 1  # format version of looks; looks of other versions are ignored
 #: Fraction of the run between the looks "before" and "after". The look "after" shows inherited or random networks
 #: soon after the first split.
 AFTER = 0.04
-QUARTERS = (0.25, 0.5, 0.75)
 SLICE = 96  # points along each side of a slice
 
 
 def stops(training: Training) -> list[tuple[str, float]]:
     """Returns (name, training seconds) of each look of a run except the look "end"."""
     config = training.state.config
-    found = {f"at-{100 * at:02.0f}": at for at in QUARTERS}
-    if config.plan and config.plan[0].at + AFTER < 1:
-        found |= {"before": config.plan[0].at, "after": config.plan[0].at + AFTER}
-    budget = config.budget or 0.0
-    return sorted(((name, at * budget) for name, at in found.items()), key=lambda item: item[1])
+    if not config.plan or config.plan[0].at + AFTER >= 1:
+        return []
+    at, budget = config.plan[0].at, config.budget or 0.0
+    return [("before", at * budget), ("after", (at + AFTER) * budget)]
 
 
 def held_out_view(scene: Scene) -> int:
@@ -78,12 +75,9 @@ def picture(state: State) -> dict[str, Any]:
     }
     points = slice_points(scene, size=SLICE)
     found["density"] = slice_density(router, points, cones=state.config.field_type.cones).half()
-    found["slice_cells"] = router.diagram.locate(points.reshape(-1, 3)).reshape(SLICE, SLICE).int()
     score = psnr(found["colour"].float() / 255, found["truth"].float() / 255)
-    return {name: value.cpu().numpy() for name, value in found.items()} | {
-        "num_cells": router.num_cells,
-        "psnr": float(score),
-    }
+    arrays = {name: value.cpu().numpy() for name, value in found.items()}
+    return {**arrays, "num_cells": router.num_cells, "psnr": float(score)}
 
 
 def load(folder: Path, name: str) -> dict[str, Any] | None:

@@ -11,19 +11,17 @@ reused, and an interrupted training is continued. Trainings of one command take 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import tyro
-from harness import metadata
+from harness import write_results
 
 from paper import balance
 from paper.experiments import EXPERIMENTS
 from paper.report import ABOUT, write_report
 from paper.runs import Run, Settings, default_scenes, failure, results, train_missing
-from voronerf.app.files import write_text
 from voronerf.app.train.config import ConfigError
 
 
@@ -39,9 +37,9 @@ def trainings(name: str, settings: Settings) -> list[Run]:
     return EXPERIMENTS[name].runs(settings) if name in EXPERIMENTS else []
 
 
-def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]:
-    """Writes an experiment's JSON from its trainings; returns {metadata, results}."""
-    described = {"benchmark": "paper", "experiment": name, "budget_seconds": settings.budget, "seeds": settings.seeds}
+def finish(name: str, runs: Sequence[Run], settings: Settings) -> None:
+    """Writes an experiment's JSON from its trainings."""
+    described: dict[str, Any] = {"experiment": name, "budget_seconds": settings.budget, "seeds": settings.seeds}
     if name == "balance":
         described["scenes"] = list(settings.scene or default_scenes())
         rows = balance.measure(runs, settings.backend, say)
@@ -54,9 +52,7 @@ def finish(name: str, runs: Sequence[Run], settings: Settings) -> dict[str, Any]
             "samples": settings.samples,
             "failed": [why for run in runs if (why := failure(run))],
         }
-    outcome = {"metadata": metadata(**described), "results": rows}
-    write_text(settings.out / f"{name}.json", json.dumps(outcome, indent=1) + "\n")
-    return outcome
+    write_results(settings.out / f"{name}.json", rows, benchmark="paper", **described)
 
 
 def repeat(settings: Settings, names: tyro.conf.Positional[tuple[str, ...]] = ()) -> None:

@@ -107,16 +107,8 @@ def write_report(out: Path) -> Path:
         raise ValueError(f"--out must hold results of experiments, got {out}")
     lines = ["# The paper's experiments, repeated"]
     for name, outcome in outcomes.items():
-        lines += [
-            "",
-            f"## {name}",
-            "",
-            ABOUT[name],
-            "",
-            conditions(outcome["metadata"]) + ".",
-            "",
-            *table(name, outcome),
-        ]
+        lines += ["", f"## {name}", "", ABOUT[name], "", conditions(outcome["metadata"]) + ".", ""]
+        lines += table(name, outcome)
         for picture in draw(name, outcome["results"], out):
             lines += ["", f"![{picture.stem}]({picture.name})"]
     write_text(out / "report.md", "\n".join(lines) + "\n")

@@ -7,7 +7,7 @@ from helpers import read_json
 def test_trainings_of_many_cells_are_measured(tmp_path, capsys):
     path, small = tmp_path / "many.json", '{"width": 8, "depth": 1, "position_octaves": 2}'
     sizes = ["--downscale", "5", "--rays", "64", "--samples", "16", "--views", "1", "--options", small]
-    many_cells.main(["--data", "builtin", "--cells", "1", "300", "--seconds", "0.5", "--json", str(path), *sizes])
+    many_cells.main(["--data", "builtin", "--cells", "1", "300", "--seconds", "0.3", "--json", str(path), *sizes])
     assert "| 300 | " in capsys.readouterr().out
     result = read_json(path)
     assert result["metadata"]["benchmark"] == "many_cells" and result["metadata"]["rays"] == 64

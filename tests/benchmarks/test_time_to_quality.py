@@ -19,7 +19,7 @@ def test_sides_train_for_the_same_time(tmp_path):
     sides = ["cells: --cells 4", "one network: --cells", "grid: --centres uniform --occupancy --cells 2", "rival: ngp"]
     sides[-1] += " --batch 256 --resolution 8 --levels 2 --log2-entries 10 --samples 8"
     path = tmp_path / "outcome.json"
-    options = "--downscale 10 --budget 0.15 --turn 0.05 --evaluations 3 --eval-views 1 --seeds 2 --clock cpu"
+    options = "--downscale 10 --budget 0.09 --turn 0.03 --evaluations 3 --eval-views 1 --seeds 2 --clock cpu"
     common = "--common=--rays 64 --samples 8 --width 8 --depth 2 --cells 3"
     said = script(BENCHMARKS / "time_to_quality.py", *options.split(), common, "--sides", *sides, "--json", path)
     result = read_json(path)
@@ -29,7 +29,7 @@ def test_sides_train_for_the_same_time(tmp_path):
     ]
     assert [row["settings"].get("cells") for row in result["results"][::2]] == [[4], [], [2], None]
     for row in result["results"]:
-        assert row["steps"] > 0 and row["curve"][-1]["seconds"] >= 0.14 and row["curve"][-1]["psnr"] == row["psnr"]
+        assert row["steps"] > 0 and row["curve"][-1]["seconds"] >= 0.08 and row["curve"][-1]["psnr"] == row["psnr"]
         assert row["seconds_to"]["32"] is None
     assert sum(line.startswith(tuple(f"| {side.split(':')[0]} |" for side in sides)) for line in said.splitlines()) == 4
 
@@ -80,14 +80,12 @@ def test_the_rival_learns_and_its_encoding_is_the_published_one():
         for corner in itertools.product((0, 1), repeat=3):
             x, y, z = (places.floor().long() + torch.tensor(corner)).tolist()
             entry = (x ^ y * 2654435761 ^ z * 805459861) % 1024 + 1024 * level
-            expected[n, level] += (1 - (places.floor() + torch.tensor(corner) - places).abs()).prod() * field.table[
-                entry
-            ]
+            weight = (1 - (places.floor() + torch.tensor(corner) - places).abs()).prod()
+            expected[n, level] += weight * field.table[entry]
     torch.testing.assert_close(field.encode(positions), expected.view(20, 4), rtol=1e-4, atol=1e-5)
     gradient = torch.rand(20, 4)
-    found, right = (
-        torch.autograd.grad(out, field.table, gradient)[0] for out in (field.encode(positions), expected.view(20, 4))
-    )
+    outs = field.encode(positions), expected.view(20, 4)
+    found, right = (torch.autograd.grad(out, field.table, gradient)[0] for out in outs)
     torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-5)
 
     ticks, scene = itertools.count(), builtin_scene(16, train_views=6, test_views=1)
