@@ -80,10 +80,8 @@ def interrupted_step(rng: random.Random, folder: Path, inputs: Path) -> str:
 
 def _tensors(step: TrainingStep, output: Any) -> list[torch.Tensor]:
     """Returns the tensors of a step's result and of everything that it changes."""
-    field, moments = (
-        step.loss.renderer.field,
-        [value for each in step.optimizer.state.values() for value in each.values()],
-    )
+    field = step.loss.renderer.field
+    moments = [value for each in step.optimizer.state.values() for value in each.values()]
     gradients = [p.grad for p in field.parameters() if p.grad is not None]  # type: ignore[union-attr]
     grid, results = step.loss.renderer.sampler.grid, (output.loss, output.output.weights, output.batch.target)
     tensors = [*results, *field.parameters(), *moments, *gradients, grid.density, grid.occupied]  # type: ignore[union-attr]

@@ -269,9 +269,8 @@ def other_tensor(rng: random.Random, tensor: Tensor) -> Any:
         size = max(0, tensor.shape[dim] + rng.choice((-tensor.shape[dim], -1, 1, 5)))
         return torch.zeros([*tensor.shape[:dim], size, *tensor.shape[dim + 1 :]], dtype=tensor.dtype)
     if kind == 8:
-        return rng.choice(
-            (lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape))
-        )()
+        makers = lambda: tensor.to_sparse(), lambda: tensor.to("meta"), lambda: tensor.expand(2, *tensor.shape)
+        return rng.choice(makers)()
     if kind == 9 and tensor.dim() and tensor.shape[0]:  # more rows than int32 can index, with stride 0
         rows = 2**31 - (tensor.dim() == 1 and not tensor.is_floating_point() and rng.random() < 0.5)
         return tensor[:1].expand(rows, *tensor.shape[1:])

@@ -54,19 +54,9 @@ def settings(rng: random.Random, out: Path, outside: Path) -> None:
 
 def link(rng: random.Random, out: Path, outside: Path) -> None:
     """Replaces a file or a folder by a link out of the folder; the stages may write through this link."""
-    of_stages = (
-        "database.db",
-        "tried.db",
-        "tried.db-journal",
-        "part.txt",
-        "trusted.part",
-        "global",
-        ".global",
-        "masks",
-    )
-    name = rng.choice(
-        (*(f"colmap/{each}" for each in of_stages), "colmap", "masks", ".images_2", "sparse", "sparse/.0")
-    )
+    of_stages = "database.db", "tried.db", "tried.db-journal", "part.txt", "trusted.part", "global", ".global", "masks"
+    names = (*(f"colmap/{each}" for each in of_stages), "colmap", "masks", ".images_2", "sparse", "sparse/.0")
+    name = rng.choice(names)
     there, target = out / name, outside / "moved"
     there.parent.mkdir(exist_ok=True)
     if there.exists():
@@ -131,16 +121,7 @@ def picture(rng: random.Random, out: Path, outside: Path) -> None:
 
 def file(rng: random.Random, out: Path, outside: Path) -> None:
     """Puts a folder, a pipe or random bytes in place of a file or a folder."""
-    names = (
-        "settings.json",
-        "database.db",
-        "database.db-journal",
-        "tried.db",
-        "part.txt",
-        "global",
-        "masks",
-        "log.zzz",
-    )
+    names = "settings.json", "database.db", "database.db-journal", "tried.db", "part.txt", "global", "masks", "log.zzz"
     path = out / rng.choice((*(f"colmap/{name}" for name in names), "masks", "images", ".images", "images_2"))
     if path.is_dir():
         shutil.rmtree(path)

@@ -319,10 +319,8 @@ class Sequence:
     def call(self) -> None:
         """Compares a call and its gradients with the loop over masks."""
         rng, router, kind = random.Random(self.rng.choice(self.forms)), self.router, self.kind
-        lead, way = (
-            self._lead(rng),
-            rng.choice(("plain", "plain", "no_grad", "inference", "checkpoint", "func", "twice")),
-        )
+        lead = self._lead(rng)
+        way = rng.choice(("plain", "plain", "no_grad", "inference", "checkpoint", "func", "twice"))
         if (way in ("func", "checkpoint") and not kind.plain) or (way == "twice" and not kind.twice):
             way = "plain"
         flat, args = self.arguments(lead, rng)

@@ -37,10 +37,8 @@ def same(first: Checkpoint, second: Checkpoint) -> bool:
     """Returns whether two checkpoints are equal bit for bit."""
     if first.values != second.values or first.tensors.keys() != second.tensors.keys():
         return False
-    return all(
-        a.dtype == b.dtype and a.shape == b.shape and torch.equal(bits(a), bits(b))
-        for a, b in ((first.tensors[name], second.tensors[name]) for name in first.tensors)
-    )
+    pairs = ((first.tensors[name], second.tensors[name]) for name in first.tensors)
+    return all(a.dtype == b.dtype and a.shape == b.shape and torch.equal(bits(a), bits(b)) for a, b in pairs)
 
 
 def bits(tensor: torch.Tensor) -> torch.Tensor:
@@ -125,9 +123,8 @@ def tensors(rng: random.Random, run: Path, outside: Path) -> None:
     elif kind == 1:
         held[name] = there.flatten() if there.dim() != 1 else there[None]
     elif kind == 2:
-        held[name] = there.to(
-            rng.choice((torch.float64, torch.float16, torch.int64, torch.int32, torch.bool, torch.uint8))
-        )
+        kinds = torch.float64, torch.float16, torch.int64, torch.int32, torch.bool, torch.uint8
+        held[name] = there.to(rng.choice(kinds))
     elif kind == 3:
         held[name] = torch.cat([there.reshape(1) if there.dim() == 0 else there] * 2)
     elif kind == 4:
@@ -137,9 +134,8 @@ def tensors(rng: random.Random, run: Path, outside: Path) -> None:
     elif kind == 5:
         held[name] = there[:0] if there.dim() else there
     else:
-        held[rng.choice(("", "x", "router.x", "optimizer.99.exp_avg", "optimizer.x", "generator.y", "\x1b[2J"))] = (
-            there.clone()
-        )
+        names = "", "x", "router.x", "optimizer.99.exp_avg", "optimizer.x", "generator.y", "\x1b[2J"
+        held[rng.choice(names)] = there.clone()
     save_checkpoint(path, Checkpoint({key: tensor.contiguous() for key, tensor in held.items()}, checkpoint.values))
 
 
@@ -164,9 +160,8 @@ def links(rng: random.Random, run: Path, outside: Path) -> None:
 
 def files(rng: random.Random, run: Path, outside: Path) -> None:
     """Replaces a file by a folder, a pipe or other contents."""
-    path = run / rng.choice(
-        ("config.json", "checkpoints/last.safetensors", "metrics.jsonl", "eval.json", "summary.json")
-    )
+    names = "config.json", "checkpoints/last.safetensors", "metrics.jsonl", "eval.json", "summary.json"
+    path = run / rng.choice(names)
     path.unlink(missing_ok=True)
     kind = rng.randrange(5)
     if kind == 0:

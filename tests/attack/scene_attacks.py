@@ -77,9 +77,8 @@ def contents(rng: random.Random, scene: Path, outside: Path) -> None:
     file = transforms(rng, scene)
     value = mutated(rng, json.loads(file.read_text()))
     if rng.random() < 0.2 and isinstance(value, dict):
-        value[
-            rng.choice(("near", "far", "k1", "k2", "p1", "camera_model", "aabb_scale", "train_filenames", "mask_path"))
-        ] = rng.choice((1e308, -1, "x", None, [], ["x"], 1e-300, "\x1b[2J"))
+        names = "near", "far", "k1", "k2", "p1", "camera_model", "aabb_scale", "train_filenames", "mask_path"
+        value[rng.choice(names)] = rng.choice((1e308, -1, "x", None, [], ["x"], 1e-300, "\x1b[2J"))
     file.write_bytes(json_text(value))
 
 
@@ -149,17 +148,15 @@ def other_picture(rng: random.Random, whole: bytes) -> bytes | None:
         return file.getvalue()
     if kind == 6:
         return rng.randbytes(rng.choice((0, 1, 30, 3000)))
-    width, height = rng.choice(
-        ((30_000, 30_000), (13_000, 13_000), (5_000, 1), (2**31 - 1, 2**31 - 1), (0, 5), (SIDE, 10**6))
-    )
-    return bomb(width, height, rng.choice((1, 8, 16)), rng.choice((0, 2, 6)))
+    sizes = (30_000, 30_000), (13_000, 13_000), (5_000, 1), (2**31 - 1, 2**31 - 1), (0, 5), (SIDE, 10**6)
+    return bomb(*rng.choice(sizes), rng.choice((1, 8, 16)), rng.choice((0, 2, 6)))
 
 
 def bomb(width: int, height: int, depth: int, colour: int) -> bytes:
     """Returns a PNG of any size whose data is a few zeros."""
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(100_000))), (b"IEND", b""))
-    parts = (
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    text = b"\x89PNG\r\n\x1a\n"
+    for name, data in chunks:
+        text += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    return text

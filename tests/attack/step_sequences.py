@@ -105,12 +105,9 @@ def _steps(rng: random.Random, trainings: list[Training], said: list[str]) -> No
                 error = str(raised)
             training.done += steps
             training.optimizer.steps_done = training.done
-            tensors = (
-                []
-                if result is None
-                else [result.loss, result.output.weights, result.output.colour, result.batch.target]
-            )
-            tensors += [each for each in training.everything() if each is not None]
+            tensors = [each for each in training.everything() if each is not None]
+            if result is not None:
+                tensors += [result.loss, result.output.weights, result.output.colour, result.batch.target]
             outcomes.append((error, [tensor.detach().clone() for tensor in tensors]))
         if outcomes[0][0] != outcomes[1][0] or not same(outcomes[0][1], outcomes[1][1]):
             raise Failed(f"another result after {'; '.join(said)} ({outcomes[0][0]!r}, {outcomes[1][0]!r})")
@@ -138,10 +135,8 @@ def _move(training: Training, rng: random.Random) -> None:
 def _lay_out(training: Training, rng: random.Random) -> None:
     """Transposes or flips the tensor of the images or of the poses, or expands its first entry to all entries."""
     tensor = rng.choice((training.batches.images, training.batches.cameras.poses))
-    every = [-1] * (tensor.dim() - 1)
-    tensor.data = rng.choice(
-        (tensor.data.transpose(1, 2), tensor.data[:1].expand(len(tensor), *every), tensor.data.flip(1))
-    )
+    first = tensor.data[:1].expand(len(tensor), *[-1] * (tensor.dim() - 1))
+    tensor.data = rng.choice((tensor.data.transpose(1, 2), first, tensor.data.flip(1)))
 
 
 def _move_all(training: Training, rng: random.Random) -> None:

@@ -12,7 +12,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -23,7 +23,7 @@ from hostile import NUMBERS, TEXTS
 from input_files import FIELDS, TINY
 
 from voronerf.app.files import read_json_lines
-from voronerf.app.train.checkpoint import Checkpoint, checkpoint_path, checkpoint_paths, last_checkpoint
+from voronerf.app.train.checkpoint import checkpoint_path, checkpoint_paths, last_checkpoint
 from voronerf.app.train.config import CHOICES, TrainConfig
 
 #: Options for the networks of interrupted trainings.
@@ -92,18 +92,13 @@ def _ends_well(pid: int) -> None:
         raise Failed(f"a training that was left alone ended with status {status}")
 
 
-def same_tensors(first: Checkpoint, second: Checkpoint, but: Container[str] = ()) -> None:
-    """Compares the tensors of two checkpoints except the names in ``but``."""
+def same_runs(whole: Path, part: Path) -> None:
+    """Compares the last checkpoints and the scores of two runs."""
+    first, second = last_checkpoint(whole), last_checkpoint(part)
     for name in sorted(first.tensors.keys() | second.tensors.keys()):
         a, b = first.tensors.get(name), second.tensors.get(name)
-        if name not in but and (a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num())):
+        if a is None or b is None or not torch.equal(a.nan_to_num(), b.nan_to_num()):
             raise Failed(f"{name} differs after a resume")
-
-
-def same_runs(whole: Path, part: Path, but: Container[str] = ()) -> None:
-    """Compares two runs except the tensors named in ``but``."""
-    first, second = last_checkpoint(whole), last_checkpoint(part)
-    same_tensors(first, second, but)
     for key in ("step", "skipped"):
         if first.values[key] != second.values[key]:
             raise Failed(f"{key} differs after a resume: {first.values[key]} and {second.values[key]}")

@@ -39,7 +39,7 @@ def layer_table(draw: random.Random) -> Program:
     """Draws the program of a random network."""
     position = draw.choice(("none", "frequency", "integrated", "hash"))
     direction = draw.choice(("none", "frequency", "spherical"))
-    layers, outputs = [], []
+    layers = []
     for index in range(draw.randint(1, 5)):
         known = ["positions", "directions", *range(index)]
         sources = [draw.choice(known) for _ in range(draw.choice((1, 1, 2, 3, 4, 12)))]
@@ -175,13 +175,8 @@ def table_of(program: Program, layout: str) -> Any:
     return records[0]
 
 
-ENUMERATORS = {"op": "ProgramOp", "function": "ProgramFunction", "binary": "ProgramBinary"}
-ENUMERATORS |= {
-    "encoding": "ProgramEncoding",
-    "finish": "ProgramFinish",
-    "to_registers": "ProgramToRegisters",
-    "layout": "ProgramLayout",
-}
+_NAMES = "Op", "Function", "Binary", "Encoding", "Finish", "Layout"
+ENUMERATORS = {name.lower(): f"Program{name}" for name in _NAMES} | {"to_registers": "ProgramToRegisters"}
 
 
 def numbers(record: Any) -> Iterator[str]:

@@ -20,7 +20,7 @@ from unittest import mock
 
 import numpy as np
 import torch
-from launches import FREE, READING, aten
+from launches import FREE, reads
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -29,13 +29,6 @@ from voronerf.ops._core import native as _native
 
 ASKED = "_workspace", "multiplies_halves"
 """Name suffixes of compiled functions that only answer a question of the host, such as a size, and launch no kernel."""
-
-
-def reads(function: Any, args: Any) -> bool:
-    """Returns whether a call makes the host wait for the device."""
-    masks = args[1] if function is aten.index.Tensor else ()
-    by_bool = any(index is not None and index.dtype == torch.bool for index in masks)
-    return by_bool or function in READING or function is aten.lift_fresh.default
 
 
 class Warned(TorchDispatchMode):

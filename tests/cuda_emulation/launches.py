@@ -20,14 +20,21 @@ from voronerf.ops._core import native as _native
 aten = torch.ops.aten
 READING = {
     *(aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default, aten.equal.default),
-    *(aten.is_nonzero.default, aten._unique2.default, aten.repeat_interleave.Tensor),
+    *(aten.is_nonzero.default, aten._unique2.default, aten.repeat_interleave.Tensor, aten.lift_fresh.default),
 }
-"""Operations with which the host reads a number or a size from the device."""
+"""Operations with which the host reads a number or a size from the device, or copies a number to it (lift_fresh)."""
 FREE = {
     *("empty", "empty_like", "new_empty", "empty_strided", "new_empty_strided", "_unsafe_view", "detach"),
     *("promote_types", "_record_function_enter_new", "_record_function_exit"),
 }
 """Operations that launch nothing: allocations, views and bookkeeping."""
+
+
+def reads(function: Any, args: Any) -> bool:
+    """Returns whether a call makes the host wait for the device."""
+    masks = args[1] if function is aten.index.Tensor else ()
+    by_bool = any(index is not None and index.dtype == torch.bool for index in masks)
+    return by_bool or function in READING
 
 
 class Asked(TorchDispatchMode):
@@ -54,11 +61,7 @@ class Asked(TorchDispatchMode):
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
         name = function.overloadpacket.__name__
-        by_bool = function is aten.index.Tensor and any(
-            index is not None and index.dtype == torch.bool for index in args[1]
-        )
-        # torch.tensor of a number is a synchronous copy from the host.
-        if function in READING or by_bool or function is aten.lift_fresh.default:
+        if reads(function, args):
             self.reads[name] += 1
         elif not function.is_view and name not in FREE:
             self.operations[name] += 1

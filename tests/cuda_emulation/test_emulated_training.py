@@ -1,6 +1,7 @@
 """Tests of whole training steps on the emulated device: all CUDA kernels in the training loop's order and dtypes."""
 
 import contextlib
+import functools
 from unittest import mock
 
 import pytest
@@ -22,10 +23,11 @@ class Losses(Callback):
         self.losses.append(state.loss)
 
 
+@functools.cache
 def losses(field, precision, *, on_device):
     """Returns the losses of a run's steps and its last state; the run splits in the middle."""
     config = TrainConfig(
-        field=field, **SMALL[field], steps=16, cells=(4,), split_at=(0.5,), width=16, rays=32, samples=(8,),
+        field=field, **SMALL[field], steps=8, cells=(4,), split_at=(0.5,), width=16, rays=32, samples=(8,),
         lr=0.005, evaluations=1, precision=precision,
     )  # fmt: skip
     kept = Losses()
@@ -42,7 +44,7 @@ def losses(field, precision, *, on_device):
 def test_steps_are_those_of_the_cpu(field, precision, allowed):
     expected, _ = losses(field, "fp32", on_device=False)
     found, state = losses(field, precision, on_device=True)
-    assert state.router.num_cells == 4 and len(found) == 16
+    assert state.router.num_cells == 4 and len(found) == 8
     assert found == pytest.approx(expected, rel=allowed)
     assert found != expected
     if precision == "fp16":

@@ -58,9 +58,12 @@ def run(layers, parts, shared, scale=1.0):
 
 @WAYS
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("size", [0.5 * LARGEST, LARGEST - 32, 65519.0, 65520.0, 2 * LARGEST, 1e6, 1e30])
+@pytest.mark.parametrize("size", [LARGEST - 32, 65519.0, 65520.0, 1e30])
 def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, size, shared):
-    """Checks values around 65,520, where float16 rounds to infinity: no NaN, and small values stay exact."""
+    """Checks values around 65,520, where float16 rounds to infinity: no NaN, and small values stay exact.
+
+    Later layers read larger values as the largest number.
+    """
     layers = network(activation)
     parts = given(layers, size)
     found, right = run(layers, parts, shared), outcome(layers, parts, torch.float32, "reference")
@@ -72,6 +75,9 @@ def test_values_up_to_the_limit_are_exact_and_those_beyond_cut_off(activation, s
         for part, exact in zip(found, outcome(layers, parts, torch.float64, "reference")):
             assert part.isfinite().all()
             assert (part.double() - exact).norm() <= 4e-3 * exact.norm() + 1e-5, list(part.shape)
+    elif activation != "sine":
+        largest = outcome(layers, given(layers, LARGEST), torch.float32, "reference")[0][:, :3]
+        torch.testing.assert_close(found[0][:, :3].float(), largest, rtol=4e-3, atol=4e-3)
 
 
 @WAYS
