@@ -56,14 +56,6 @@ def test_what_does_not_fit_a_signature_is_refused() -> None:
             compiled.encode(tuple.__new__(compiled.Encoding, whole[:count]), torch.empty(4, 9), cpu)
 
 
-def test_an_instruction_set_that_is_not_there_is_refused() -> None:
-    with (
-        pytest.raises(ValueError, match=r"^using_isa: isa must be one of portable.*got 'sse9'$"),
-        native.using_isa("sse9"),
-    ):
-        pass
-
-
 def test_a_function_of_one_side_alone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Functions are bound by name, not by number: a function that only Python knows is not mistaken for another."""
     monkeypatch.setitem(FUNCTIONS, "cube", Function(lambda x, a, b: x**3))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
-from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import refuses
+from helpers import on_any_number_of_threads, python, refuses, same
 from torch import Tensor
 
 from voronerf import cell_sort, locate_cell, nearest_centre, ops
@@ -20,12 +19,16 @@ from voronerf.ops.locate_cell.reference import locate_cell as reference_locate
 from voronerf.ops.nearest_centre.reference import distances
 from voronerf.ops.nearest_centre.reference import nearest_centre as reference_nearest
 
+sys.path.append(str(Path(__file__).parents[1] / "ops"))  # for cases
+from cases import Draw
+from cases.locate_cell import tree
+
 pytestmark = pytest.mark.native
 
 if backends.missing("native", torch.device("cpu")) is None:
     from voronerf.ops._core import native as _native
 
-CELLS = (1, 2, 15, 16, 17, 255, 256, 257, 4096)
+CELLS = (1, 15, 16, 17, 256, 257, 4096)
 # Row counts next to the numbers of lanes and tile rows of every instruction set; BLOCK is the number of rows in a task.
 ROWS = (0, 1, 3, 7, 8, 9, 15, 17, 31, 33, 63, 64, 65, 129)
 BLOCK = 2048
@@ -106,36 +109,16 @@ def test_nearest_sends_non_finite_points_to_cell_0(isa: str) -> None:
             assert torch.equal(nearest_centre(points, centres, backend="native"), reference_nearest(points, centres))
 
 
-def test_nearest_of_mixed_and_half_types_and_strided_tensors(isa: str) -> None:
-    points, centres = torch.rand(100, 6)[:, ::2], torch.rand(3, 40).T
-    assert not points.is_contiguous()
-    chosen(points, centres)
-    for dtype in (torch.float16, torch.bfloat16, torch.float64):
-        chosen(points.to(dtype), centres)
-        chosen(points, centres.to(dtype))
-
-
-@pytest.fixture(params=[1, 2, 3])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
-
-
 # A call with at most k / 64 rows is a radix sort. In other calls, threads have two chunks if there are at most 4096
 # cells and many rows. Calls with the most rows prefetch.
-@pytest.mark.parametrize("k", [1, 2, 3, 255, 256, 257, 4096, 4097, 5000, 100_000])
-@pytest.mark.parametrize("n", [0, 1, 2, 33, 64, 1562, 1563, 2047, 2048, 2049, 8191, 8192, 50_001, 131_329])
-def test_sort(threads: int, n: int, k: int) -> None:
+@pytest.mark.parametrize("k", [1, 3, 255, 256, 257, 4096, 4097, 100_000])
+@pytest.mark.parametrize("n", [0, 1, 33, 1562, 1563, 2048, 2049, 8192, 50_001, 131_329])
+def test_sort(n: int, k: int) -> None:
     # Half of the cells stay empty, and one cell holds half of the rows.
     cells = torch.randint(0, max(1, k // 2), (n,), dtype=torch.int32)
     cells[torch.rand(n) < 0.5] = k - 1
-    order, offsets = cell_sort(cells, k, backend="native")
-    expected_order, expected_offsets = reference_sort(cells, k)
-    assert torch.equal(order, expected_order)
-    assert torch.equal(offsets, expected_offsets)
-    assert (order.dtype, offsets.dtype) == (torch.int32, torch.int32)
+    result = on_any_number_of_threads(lambda: cell_sort(cells, k, backend="native"))
+    assert same(result, reference_sort(cells, k)) and all(part.dtype == torch.int32 for part in result)
 
 
 @pytest.mark.parametrize("k", [1, 2**20, 2**20 + 1, 2**22 + 5, 2**24])
@@ -150,98 +133,64 @@ def test_sort_of_few_rows_in_many_cells(k: int) -> None:
 
 @pytest.mark.parametrize("bad", [-1, "k", 2**31 - 1, -(2**31)])
 @pytest.mark.parametrize(("n", "k"), [(10_000, 7), (10_000, 5000), (20, 5000)])
-def test_sort_refuses_cells_out_of_range(threads: int, n: int, k: int, bad: int | str) -> None:
+def test_sort_refuses_cells_out_of_range(n: int, k: int, bad: int | str) -> None:
     value = k if bad == "k" else int(bad)
+    message = rf"cell_sort: cells must lie in 0 to {k - 1}, got values from .*{value}"
     for row in (0, 2 * n // 5, n // 2, n - 1):
         cells = torch.randint(0, k, (n,), dtype=torch.int32)
         cells[row] = value
-        with pytest.raises(ValueError, match=rf"cell_sort: cells must lie in 0 to {k - 1}, got values from .*{value}"):
-            cell_sort(cells, k, backend="native")
+
+        def call(cells: Tensor = cells) -> tuple[()]:
+            with pytest.raises(ValueError, match=message):
+                cell_sort(cells, k, backend="native")
+            return ()
+
+        on_any_number_of_threads(call)
 
 
-def random_tree(sizes: tuple[int, ...], uneven: bool = True) -> dict[str, Tensor | int]:
-    """Returns a tree with `sizes` children at each level; if uneven, every third centre is a leaf at any level."""
-    rows: list[list[Tensor]] = [[]]
-    child: list[list[int]] = [[]]
-    level, leaves = [0], 0
-    for depth, size in enumerate(sizes):
-        below = []
-        for diagram in level:
-            for i in range(size):
-                rows[diagram].append(torch.rand(3))
-                if depth == len(sizes) - 1 or (uneven and i % 3 == 2):
-                    leaves += 1
-                    child[diagram].append(-leaves)
-                else:
-                    below.append(len(rows))
-                    child[diagram].append(len(rows))
-                    rows.append([])
-                    child.append([])
-        level = below
-    counts = torch.tensor([0] + [len(own) for own in rows])
-    return {
-        "centres": torch.stack([row for own in rows for row in own]),
-        "child_offsets": counts.cumsum(0).int(),
-        "child": torch.tensor([c for own in child for c in own], dtype=torch.int32),
-        "depth": len(sizes),
-    }
+def tree_of(depth: int, width: int, **pinned: bool) -> dict[str, Tensor | int]:
+    """Returns a tree with ``width`` centres in each diagram; ``refined=False`` refines one centre of each level."""
+    tables, _ = tree(Draw(depth, free=True, depth=depth, width=width, **pinned))
+    return tables
 
 
-@pytest.mark.parametrize("sizes", [(1,), (5,), (16, 16), (3, 1, 4), (2, 2, 2, 2)])
-@pytest.mark.parametrize("uneven", [False, True])
-def test_locate(isa: str, sizes: tuple[int, ...], uneven: bool) -> None:
-    tree = random_tree(sizes, uneven)
+@pytest.mark.parametrize(("depth", "width"), [(1, 1), (1, 5), (2, 16), (3, 4)])
+@pytest.mark.parametrize("refined", [False, True])
+def test_locate(isa: str, depth: int, width: int, refined: bool) -> None:
+    tables = tree_of(depth, width, refined=refined)
     for n in (0, 1, 33, BLOCK - 1, BLOCK + 1):
         for dtype in DTYPES:
-            points = torch.rand(n, 3, dtype=dtype)
+            points = torch.randn(n, 3, dtype=dtype)
             if n > 30:
                 points[30] = torch.nan
-            leaves = locate_cell(points, **tree, backend="native")
-            assert torch.equal(leaves, reference_locate(points, **tree))
+            leaves = locate_cell(points, **tables, backend="native")
+            assert torch.equal(leaves, reference_locate(points, **tables))
 
 
 def test_locate_breaks_ties_as_nearest_centre_does(isa: str) -> None:
-    tree = random_tree((8, 8), uneven=False)
-    tree["centres"] = torch.randint(-2, 3, tree["centres"].shape).float()
+    tables = tree_of(2, 8, refined=True)
+    tables["centres"] = torch.randint(-2, 3, tables["centres"].shape).float()
     points = torch.randint(-4, 5, (3000, 3)).float() / 2
-    assert torch.equal(locate_cell(points, **tree, backend="native"), reference_locate(points, **tree))
+    assert torch.equal(locate_cell(points, **tables, backend="native"), reference_locate(points, **tables))
 
 
 @pytest.mark.cuda
 def test_locate_on_cuda_stays_inside_unsound_tables() -> None:
     points = torch.rand(100, 3)
-    tree = random_tree((2, 2), uneven=False)
-    sound = locate_cell(points, **tree, backend="native")
-    second = reference_nearest(points, tree["centres"][:2]) == 1
+    sound_tables = tree_of(2, 2, refined=True)
+    sound = locate_cell(points, **sound_tables, backend="native")
+    second = reference_nearest(points, sound_tables["centres"][:2]) == 1
     for change in ({"child": [1, 7, -1, -2, -3, -4]}, {"child_offsets": [0, 2, 4, 9]}, {"child_offsets": [0, 2, 4, 4]}):
-        tables = {**tree, **{name: torch.tensor(value).int() for name, value in change.items()}}
+        tables = {**sound_tables, **{name: torch.tensor(value).int() for name, value in change.items()}}
         on_device = {name: value.cuda() if isinstance(value, Tensor) else value for name, value in tables.items()}
         leaves = locate_cell(points.cuda(), **on_device, backend="native").cpu()
         assert (leaves[second] < 0).all() and torch.equal(leaves[~second], sound[~second])
 
 
-def run_python(code: str, **environment: str) -> None:
-    command = [sys.executable, "-c", code]
-    result = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment})
-    assert result.returncode == 0, result.stderr
-
-
-def test_one_openmp_runtime_and_a_forced_instruction_set() -> None:
+def test_instruction_sets_by_name_and_one_openmp_runtime() -> None:
+    """An unknown instruction set is an error whatever the backend; the next import takes a known one."""
     code = """
-import torch, voronerf
-from voronerf.ops._core import native as _native
-assert _native.describe()["instruction set"] == "portable"
-voronerf.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3), backend="native")
-names = ("libgomp", "libiomp", "libomp")
-loaded = {line.split()[-1] for line in open("/proc/self/maps") if line.split()[-1].split("/")[-1].startswith(names)}
-assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), loaded
-"""
-    run_python(code, OMP_NUM_THREADS="2", VORONERF_ISA="portable")
-
-
-def test_an_unknown_instruction_set_is_an_error_whatever_the_backend() -> None:
-    code = """
-import torch
+import os, torch, voronerf
 from voronerf.ops._core import backends
 try:
     backends.resolve("nearest_centre", backend="auto", device=torch.device("cpu"), dtype=torch.float32)
@@ -250,8 +199,15 @@ except ValueError as error:
     assert str(error).endswith("got 'sse9'"), error
 else:
     raise SystemExit("nothing was raised")
+os.environ["VORONERF_ISA"] = "portable"
+from voronerf.ops._core import native as _native
+assert _native.describe()["instruction set"] == "portable"
+voronerf.nearest_centre(torch.rand(10000, 3), torch.rand(9, 3), backend="native")
+names = ("libgomp", "libiomp", "libomp")
+loaded = {line.split()[-1] for line in open("/proc/self/maps") if line.split()[-1].split("/")[-1].startswith(names)}
+assert len(loaded) == 1 or (not loaded and not _native.describe()["openmp"]), loaded
 """
-    run_python(code, VORONERF_ISA="sse9")
+    python("-c", code, env={**os.environ, "OMP_NUM_THREADS": "2", "VORONERF_ISA": "sse9"})
 
 
 @pytest.mark.parametrize(
@@ -306,12 +262,11 @@ def test_the_gain_of_bfloat16_is_the_same_each_time() -> None:
     assert (gains[0] > 0) == ("avx512_bf16" in _native.SUPPORTED_ISAS)
 
 
-def test_peak_errors() -> None:
+def test_unknown_kinds_and_instruction_sets_are_refused() -> None:
     refuses("measure_peak: kind must be one of float32, bfloat16, copy, got 'fp32'", _native.measure_peak, "fp32")
-    with pytest.raises(
-        ValueError, match=r"^measure_peak: isa must be one of portable, neon, .*avx512_bf16, amx, got 'sse'"
-    ):
-        _native.measure_peak("copy", isa="sse")
+    known = "isa must be one of portable, neon, avx2, avx512, avx512_bf16, amx, got 'sse'"
+    refuses(f"measure_peak: {known}", _native.measure_peak, "copy", isa="sse")
+    refuses("using_isa: isa must be one of portable", _native.using_isa("sse9").__enter__)
 
 
 def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
@@ -329,16 +284,13 @@ def test_a_driver_older_than_the_toolkit_is_refused(monkeypatch):
         assert said is None if reason is None else said.startswith(reason)
 
 
-@pytest.mark.native
-@pytest.mark.parametrize("threads", [1, 2])
-def test_numbers_below_the_normal_range_are_zero_in_kernels_alone(threads: int) -> None:
+def test_numbers_below_the_normal_range_are_zero_in_kernels_alone() -> None:
     """Each denormal costs some hundred cycles, so kernels flush it to 0; torch keeps denormals on the same threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        rows = torch.full((100_000, 1), 1e-20)
-        offsets, weight = torch.tensor([0, 100_000], dtype=torch.int32), torch.full((1, 1, 1), 1e-20)
-        assert not ops.grouped_linear(rows, offsets, weight, backend="native").any()
-        assert bool((rows * 1e-20).all())
-    finally:
-        torch.set_num_threads(before)
+    rows = torch.full((100_000, 1), 1e-20)
+    offsets, weight = torch.tensor([0, 100_000], dtype=torch.int32), torch.full((1, 1, 1), 1e-20)
+
+    def call() -> list[Tensor]:
+        return [ops.grouped_linear(rows, offsets, weight, backend="native"), rows * 1e-20]
+
+    flushed, kept = on_any_number_of_threads(call)
+    assert not flushed.any() and bool(kept.all())

@@ -11,30 +11,41 @@ from tolerances import assert_as_exact
 from voronerf.ops import composite
 
 pytestmark = pytest.mark.native
+native = pytest.importorskip("voronerf.ops._core.native")
 
 INF = float("inf")
 
 
 def assert_close(arguments: dict, parts: tuple[str, ...] = PARTS) -> None:
+    """Compares the results with each instruction set of this processor."""
     exact, plain = (evaluate(arguments, dtype, "reference", parts) for dtype in (torch.float64, torch.float32))
-    for actual, same, right in zip(evaluate(arguments, torch.float32, "native", parts), plain, exact):
-        assert_as_exact(actual, same, right)
+    for isa in native.SUPPORTED_ISAS:
+        with native.using_isa(isa):
+            results = evaluate(arguments, torch.float32, "native", parts)
+        for actual, same, right in zip(results, plain, exact):
+            assert_as_exact(actual, same, right)
 
 
-@pytest.mark.parametrize("background", ["ray", "all", ""])
-@pytest.mark.parametrize("c", [1, 2, 3, 4, 19])
-def test_channels_and_backgrounds(isa: str, c: int, background: str) -> None:
-    assert_close(dense(5, 17, c, background))
-    assert_close(scene([0, 9, 1, 0, 40], c, background, outside=(3, 2)))
+SAMPLES = (0, 1, 2, 3, 4, 5, 15, 16, 17, 31, 33, 64, 127, 129, 300)
 
 
-@pytest.mark.parametrize("s", [0, 1, 2, 3, 4, 5, 15, 16, 17, 31, 33, 63, 64, 127, 128, 129, 300])
-def test_any_number_of_samples(isa: str, s: int) -> None:
-    assert_close(dense(3, s))
+@pytest.mark.parametrize("s", SAMPLES)
+def test_any_number_of_samples(s: int) -> None:
+    """The 15 numbers of samples have all pairs of a number of channels and a kind of background."""
+    number = SAMPLES.index(s)
+    c, background = (1, 2, 3, 4, 19)[number % 5], ("ray", "all", "")[number % 3]
+    assert_close(dense(5, s, c, background))
+    assert_close(scene([0, s, 1, 0, 40], c, background, outside=(3, 2)))
+
+
+@pytest.mark.parametrize("parts", [("colour",), ("opacity",), ("depth",), ("weights",), ("depth", "weights")])
+def test_gradients_of_some_outputs(parts: tuple[str, ...]) -> None:
+    for arguments in (dense(4, 21), dense(4, 21, 2, "all"), scene([4, 0, 9])):
+        assert_close(arguments, parts)
 
 
 @pytest.mark.parametrize("counts", [[], [0], [0, 0], [1], [1, 0, 1], [700, 0, 3], [1] * 50])
-def test_any_number_of_rays(isa: str, counts: list[int]) -> None:
+def test_any_number_of_rays(counts: list[int]) -> None:
     assert_close(scene(counts))
     assert_close(scene(counts, background="all", outside=(7, 1)))
 

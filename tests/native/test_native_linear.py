@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 import platform
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import python
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from voronerf.ops import frequency_encode
 from voronerf.ops.grouped_linear import reference as specification
 
+compiled = pytest.importorskip("voronerf.ops._core.native")
 native = pytest.importorskip("voronerf.ops.grouped_linear.native")
 
 ACTIVATIONS = ("none", "relu", "softplus", "sigmoid", "sine")
-# Even and odd widths, multiples of 16 and 32, and more columns than a panel of packed weights (16 or 64). o is below,
-# equal to or above 16, since outputs are padded to a multiple of 16.
+# Inputs and outputs: even and odd widths, multiples of 16 and 32, and more columns than a panel of packed weights (16
+# or 64). Outputs are below, equal to or above 16, since they are padded to a multiple of 16.
 WIDTHS = ((63, 64), (64, 63), (64, 64), (48, 16), (16, 48), (1, 1), (3, 90), (90, 4), (256, 32), (32, 129))
+WIDTHS += ((4, 3), (5, 17), (63, 33), (64, 21), (1, 65), (90, 5))
 # The cells have 0, 1, 96, 0, 199 and 2 rows; a tile has 96. Rows without a cell lie before and after them.
 OFFSETS = (2, 2, 3, 99, 99, 298, 300)
 ROWS = 303
@@ -43,37 +45,32 @@ def evaluate(run, x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, act
 
 
 def compare(x: Tensor, weight: Tensor, bias: Tensor | None, g: Tensor, activation: str) -> None:
-    """Compares with float64 results of the same values; allows rounding of results and of products' operands."""
+    """Compares with float64 for each instruction set; allows the rounding of results and of products' operands."""
     if activation == "relu":  # no gradient at the kink, where two correct implementations may differ
         raised = None if bias is None else bias.double()
         y = evaluate(specification.grouped_linear, x.double(), weight.double(), raised, g.double(), "none")[0]
         g = torch.where(y.abs() < 0.05, 0, g)
     wide = [None if tensor is None else tensor.double() for tensor in (x, weight, bias, g)]
     exact = evaluate(specification.grouped_linear, *wide, activation)
-    actual = evaluate(native.grouped_linear, x, weight, bias, g, activation)
     step = torch.finfo(x.dtype).eps
-    for got, want in zip(actual, exact):
-        assert got.dtype == x.dtype
-        scale = float(want.abs().max())
-        torch.testing.assert_close(got.double(), want, rtol=step, atol=(4e-6 if step < 1e-5 else step) * scale)
-    assert not actual[0][: OFFSETS[0]].any() and not actual[0][OFFSETS[-1] :].any()
-    assert not actual[1][: OFFSETS[0]].any() and not actual[1][OFFSETS[-1] :].any()
-    assert not actual[2][0].any() and not actual[2][3].any()  # cells without rows
+    for isa in compiled.SUPPORTED_ISAS:
+        with compiled.using_isa(isa):
+            actual = evaluate(native.grouped_linear, x, weight, bias, g, activation)
+        for got, want in zip(actual, exact):
+            assert got.dtype == x.dtype
+            scale = float(want.abs().max())
+            torch.testing.assert_close(got.double(), want, rtol=step, atol=(4e-6 if step < 1e-5 else step) * scale)
+        assert not actual[0][: OFFSETS[0]].any() and not actual[0][OFFSETS[-1] :].any()
+        assert not actual[1][: OFFSETS[0]].any() and not actual[1][OFFSETS[-1] :].any()
+        assert not actual[2][0].any() and not actual[2][3].any()  # cells without rows
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-@pytest.mark.parametrize(("i", "o"), WIDTHS)
-def test_widths(i: int, o: int, dtype: torch.dtype, isa: str) -> None:
-    compare(*inputs(i, o, dtype), "none")
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_activations(activation: str, dtype: torch.dtype, isa: str) -> None:
-    for i, o in ((63, 64), (64, 21)):
-        x, weight, _, g = inputs(i, o, dtype)
-        compare(x, weight, None, g, activation)
-    compare(*inputs(64, 32, dtype), activation)
+@pytest.mark.parametrize("number", range(len(WIDTHS)), ids=[f"{i}-{o}" for i, o in WIDTHS])
+def test_widths_and_activations(number: int) -> None:
+    """Each activation has several widths, with and without a bias."""
+    for dtype in (torch.float32, torch.bfloat16):
+        x, weight, bias, g = inputs(*WIDTHS[number], dtype)
+        compare(x, weight, bias if number % 2 else None, g, ACTIVATIONS[number % 5])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
@@ -89,18 +86,6 @@ def test_strided_and_unaligned(dtype: torch.dtype) -> None:
             assert torch.equal(got, want)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=["float32", "bfloat16"])
-def test_what_is_no_number_stays_in_its_row(dtype: torch.dtype) -> None:
-    x, weight, bias, _ = inputs(63, 64, dtype)
-    offsets = torch.tensor(OFFSETS, dtype=torch.int32)
-    clean = native.grouped_linear(x, offsets, weight, bias, activation="relu")
-    x[50], x[51, 0] = torch.nan, torch.inf
-    result = native.grouped_linear(x, offsets, weight, bias, activation="relu")
-    assert result[50].isnan().all() and not result[51].isfinite().all()
-    rest = [row for row in range(ROWS) if row not in (50, 51)]
-    assert torch.equal(result[rest], clean[rest])
-
-
 def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
     """Under a profiler, a mode or a transform the custom op runs; otherwise the compiled function runs directly."""
     arguments = *inputs(63, 64, torch.float32), "sine"
@@ -114,48 +99,6 @@ def test_calls_past_the_dispatcher_give_what_it_gives() -> None:
     with FakeTensorMode(allow_non_fake_inputs=True) as mode:
         fake = native.grouped_linear(mode.from_tensor(x), torch.tensor(OFFSETS, dtype=torch.int32), weight, bias)
     assert type(fake) is not Tensor and fake.shape == (ROWS, 64)
-
-
-def test_large_results_ask_for_huge_pages() -> None:
-    """The test runs in a fresh process, whose allocator has no freed memory to reuse."""
-    if not sys.platform.startswith("linux"):
-        pytest.skip("Linux alone has transparent huge pages")
-    path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
-    if not path.exists() or "[never]" in path.read_text():
-        pytest.skip("huge pages are switched off here")
-    program = """
-import resource, torch
-from voronerf.ops._core.memory import on_huge_pages
-faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-before = faults()
-out = torch.empty(1 << 24)
-on_huge_pages(out)
-out.zero_()
-print(faults() - before, int(out.count_nonzero()))
-"""
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    assert int(result[0]) < 2000 and result[1] == "0"  # instead of 16,384 small pages
-
-
-def test_what_a_step_frees_is_kept() -> None:
-    """In a fresh process, a step reuses the memory that the previous equal step has freed."""
-    if platform.libc_ver()[0] != "glibc":
-        pytest.skip("glibc alone can be asked")
-    program = """
-import resource, torch
-from voronerf.app.cli import keep_freed_memory
-keep_freed_memory()
-faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-step = lambda: [torch.ones(1 << 22) for _ in range(16)]
-found = []
-for _ in range(6):
-    before = faults()
-    step()
-    found.append(faults() - before)
-print(sorted(found[1:])[2])
-"""
-    results = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(results) < 2000  # the median of five steps, since the system may reclaim pages; a step uses 65,536
 
 
 def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
@@ -175,21 +118,34 @@ def test_large_results_reuse_the_memory_of_those_that_are_gone() -> None:
     assert len({other.untyped_storage().data_ptr() for other in (*others, third, part)}) == 5
 
 
-def test_large_results_of_equal_calls_are_written_to_the_same_pages() -> None:
-    """The calls run in a fresh process."""
+def test_large_results_take_few_new_pages() -> None:
+    """Counts the page faults of a fresh process, whose allocator has no freed memory to reuse."""
     if not sys.platform.startswith("linux"):
         pytest.skip("elsewhere the allocator decides")
     program = """
 import resource, torch
 from voronerf.ops import frequency_encode
-faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-found = []
+from voronerf.ops._core.memory import on_huge_pages
+def faults(run):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    run()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+def whole():
+    out = torch.empty(1 << 24)
+    on_huge_pages(out)
+    out.zero_()
+found, equal = [faults(whole)], []
 for n in (1 << 18, (1 << 18) - 100) * 4:
     x = torch.rand(n, 3)
-    before = faults()
-    frequency_encode(x, 10, backend="native")
-    found.append(faults() - before)
-print(sorted(found[2:])[3])
+    equal.append(faults(lambda: frequency_encode(x, 10, backend="native")))
+from voronerf.app.cli import keep_freed_memory
+keep_freed_memory()
+steps = [faults(lambda: [torch.ones(1 << 22) for _ in range(16)]) for _ in range(6)]
+print(*found, sorted(equal[2:])[3], sorted(steps[1:])[2])
 """
-    results = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(results) < 16  # instead of 16,128 small pages, or 31 huge ones
+    huge, equal, step = map(int, python("-c", program).split())
+    path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    assert huge < 2000 or not path.exists() or "[never]" in path.read_text()  # instead of 16,384 small pages
+    assert equal < 16  # equal calls write to the same pages, instead of 16,128 small pages, or 31 huge ones
+    # The median of five steps, since the system may reclaim pages; a step uses 65,536. glibc alone can be asked.
+    assert step < 2000 or platform.libc_ver()[0] != "glibc"

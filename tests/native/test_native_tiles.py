@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
+from test_native_mlp import arguments, cast, evaluate
 from torch import Tensor
 
 from voronerf.ops import frequency_encode, grouped_mlp
@@ -42,39 +43,13 @@ def precision() -> Iterator[Callable[[str], None]]:
 
 
 def network(
-    widths: tuple[int, ...],
-    p: int,
-    octaves: int | None,
-    counts: list[int],
-    seed: int = 0,
-    activation: str = "softplus",
-) -> dict[str, object]:
+    widths: tuple[int, ...], p: int, octaves: int | None, counts: list[int], activation: str = "softplus"
+) -> dict:
     """Returns arguments for a chain of layers, whose last layer reads the positions again."""
-    layers = [Layer(("positions",), widths[0], activation)]
-    layers += [Layer((i,), width, activation) for i, width in enumerate(widths[1:])]
+    layers = [Layer((i - 1 if i else "positions",), width, activation) for i, width in enumerate(widths)]
     layers.append(Layer((len(layers) - 1, "positions"), 4))
-    table = MLP(tuple(layers), (len(layers) - 1,), position_octaves=octaves)
-    draw = torch.Generator().manual_seed(seed)
-    k, rows = len(counts), sum(counts)
-    shapes = table.weight_shapes(p, 0)
-    return {
-        "layers": table,
-        "positions": torch.randn(rows, p, generator=draw),
-        "offsets": torch.tensor([0, *torch.tensor(counts).cumsum(0).tolist()], dtype=torch.int32),
-        "weights": [torch.randn(k, o, i, generator=draw) / i**0.5 for o, i in shapes],
-        "biases": [torch.randn(k, o, generator=draw) for o, _ in shapes],
-    }
-
-
-def outcome(call: dict[str, object], dtype: torch.dtype, backend: str) -> list[Tensor]:
-    """Returns the result and the gradients of positions, weights and biases."""
-    leaves = [call["positions"], *call["weights"], *call["biases"]]  # type: ignore[misc]
-    leaves = [leaf.to(dtype, copy=True).requires_grad_() for leaf in leaves]
-    count = len(call["weights"])  # type: ignore[arg-type]
-    x, weights, biases = leaves[0], leaves[1 : 1 + count], leaves[1 + count :]
-    y = grouped_mlp(x, call["offsets"], weights, biases, layers=call["layers"], backend=backend)  # type: ignore[arg-type]
-    arriving = torch.sin(torch.arange(y.numel(), dtype=torch.float64)).view(y.shape).to(y.dtype)
-    return [y.detach(), *torch.autograd.grad(y, leaves, arriving)]
+    call = arguments(MLP(tuple(layers), (len(layers) - 1,), position_octaves=octaves), counts, p=p)
+    return {**call, "positions": call["positions"].float()}  # octaves would multiply the rounding to float32
 
 
 def error(results: list[Tensor], exact: list[Tensor]) -> float:
@@ -90,10 +65,10 @@ def error(results: list[Tensor], exact: list[Tensor]) -> float:
 def test_each_precision_is_as_exact_as_it_says(
     widths: tuple[int, ...], p: int, octaves: int | None, asked: str, registers: str, precision: Callable[[str], None]
 ) -> None:
-    arguments = network(widths, p, octaves, [97, 0, 1, 40])
-    exact, tight = outcome(arguments, torch.float64, "reference"), outcome(arguments, torch.float32, "native")
+    call = network(widths, p, octaves, [97, 0, 1, 40])
+    exact, tight = evaluate(call, torch.float64, "reference"), evaluate(call, torch.float32, "native")
     precision(asked)
-    actual = outcome(arguments, torch.float32, "native")
+    actual = evaluate(call, torch.float32, "native")
     assert error(actual, exact) < PRECISIONS[asked]
     same = all(torch.equal(a, b) for a, b in zip(actual, tight))
     assert same == (asked == "highest")
@@ -122,20 +97,20 @@ def test_octaves_are_no_less_exact_than_what_they_are_rounded_to(
 
 
 @pytest.mark.parametrize("asked", ["high", "medium"])
-@pytest.mark.parametrize("rows", [0, 1, 2, 15, 16, 17, 31, 32, 33, 63, 65, 95, 96, 97, 129, 1025])
+@pytest.mark.parametrize("rows", [0, 1, 15, 16, 17, 31, 33, 95, 96, 97, 1025])
 def test_any_number_of_rows(rows: int, asked: str, registers: str, precision: Callable[[str], None]) -> None:
-    arguments = network((40, 64), 3, 4, [rows, 3])
-    exact = outcome(arguments, torch.float64, "reference")
+    call = network((40, 64), 3, 4, [rows, 3])
+    exact = evaluate(call, torch.float64, "reference")
     precision(asked)
-    assert error(outcome(arguments, torch.float32, "native"), exact) < PRECISIONS[asked]
+    assert error(evaluate(call, torch.float32, "native"), exact) < PRECISIONS[asked]
 
 
 def test_layers_with_a_relu_read_nothing_behind_their_columns(registers: str, precision: Callable[[str], None]) -> None:
     # A layer of 16 columns overwrites the slot of 32 columns, whose other 16 are nonzero.
-    arguments = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
-    exact = outcome(arguments, torch.float64, "reference")
+    call = network((32, 16, 16), 3, 4, [97, 0, 1, 400], activation="relu")
+    exact = evaluate(call, torch.float64, "reference")
     precision("high")
-    assert error(outcome(arguments, torch.float32, "native"), exact) < PRECISIONS["high"]
+    assert error(evaluate(call, torch.float32, "native"), exact) < PRECISIONS["high"]
 
 
 def test_other_threads_and_forked_children_compute_the_same(precision: Callable[[str], None], registers: str) -> None:
@@ -144,10 +119,10 @@ def test_other_threads_and_forked_children_compute_the_same(precision: Callable[
     before = torch.get_num_threads()
     torch.set_num_threads(1)  # a forked child can run only with one thread
     try:
-        want = outcome(call, torch.float32, "native")
+        want = evaluate(call, torch.float32, "native")
         results: list[list[Tensor]] = []
         others = [
-            threading.Thread(target=lambda: results.append(outcome(call, torch.float32, "native"))) for _ in range(3)
+            threading.Thread(target=lambda: results.append(evaluate(call, torch.float32, "native"))) for _ in range(3)
         ]
         for other in others:
             other.start()
@@ -156,11 +131,9 @@ def test_other_threads_and_forked_children_compute_the_same(precision: Callable[
         assert len(results) == 3
         assert all(torch.equal(a, b) for result in results for a, b in zip(result, want, strict=True))
         with torch.no_grad():
-            y = want[0]
             child = os.fork()
             if child == 0:
-                arguments = (call["positions"], call["offsets"], call["weights"], call["biases"])
-                same = torch.equal(grouped_mlp(*arguments, layers=call["layers"], backend="native"), y)  # type: ignore[arg-type]
+                same = torch.equal(grouped_mlp(**cast(call, torch.float32), backend="native"), want[0])
                 os._exit(0 if same else 1)
             _, status = os.waitpid(child, 0)
         assert os.waitstatus_to_exitcode(status) == 0

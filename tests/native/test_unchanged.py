@@ -9,9 +9,9 @@ import weakref
 
 import pytest
 import torch
-from torch import Tensor
+from test_calls import without_the_exchange
 
-from voronerf.ops._core import backends, native
+from voronerf.ops._core import backends
 from voronerf.ops._core.unchanged import Stale, Values, unchanged
 
 pytestmark = pytest.mark.native
@@ -68,15 +68,9 @@ CHANGED = {
 }
 
 
-@contextlib.contextmanager
 def exchange(there):
     """Makes the guard use torch's tensor exchange API, or only Python's methods."""
-    if not there:
-        native.compiled.register_torch(native.DTYPES, (Tensor, torch.nn.Parameter), None)
-    try:
-        yield
-    finally:
-        native.register_torch(native.compiled)
+    return contextlib.nullcontext() if there else without_the_exchange()
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["exchange", "methods"])

@@ -9,8 +9,6 @@ from torch.nn.functional import linear, softplus
 
 from voronerf.ops._core.encodings import ENCODINGS, wide
 from voronerf.ops._core.layers import DIRECTIONS, POSITIONS
-from voronerf.ops.hash_encode.reference import hash_encode
-from voronerf.ops.network.reference import cells_of
 
 ACTIVATIONS = {
     "none": lambda z: z,
@@ -34,13 +32,8 @@ def encoded(x, layers, source):
     return x if encoding is None else ENCODINGS[encoding[0]].formula(wide(x), encoding[1])
 
 
-def grouped_mlp(positions, offsets, weights, biases, *, layers, directions=None, direction_index=None, features=None):
-    if layers.grid is None:
-        where = encoded(positions, layers, POSITIONS)
-    else:
-        cells = cells_of(offsets, positions) if features.dim() == 3 else None
-        where = hash_encode(positions, features, layers.grid, cells=cells)
-    sources = {POSITIONS: where.to(weights[0].dtype)}
+def grouped_mlp(positions, offsets, weights, biases, *, layers, directions=None, direction_index=None):
+    sources = {POSITIONS: encoded(positions, layers, POSITIONS).to(weights[0].dtype)}
     if layers.uses_directions:
         seen = encoded(directions, layers, DIRECTIONS).to(weights[0].dtype)
         sources[DIRECTIONS] = seen if direction_index is None else seen[direction_index]

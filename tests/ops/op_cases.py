@@ -29,6 +29,13 @@ def need(op, backend, device, dtype):
         pytest.skip(reason)
 
 
+def compared(op):
+    """Returns a parametrization over the backends and devices of an op, without the reference on the CPU."""
+    backs = [(backend, device) for device in ("cpu", "cuda") for backend in backends.implemented(op)]
+    runs = [run for run in backs if run != ("reference", "cpu") and op in backends.ops(*run)]
+    return pytest.mark.parametrize(("backend", "device"), runs, indirect=["device"], ids=map("-".join, runs))
+
+
 def offsets_of(counts, device="cpu"):
     """Returns the cell offsets for the numbers of samples in the cells."""
     return torch.tensor([0, *counts]).cumsum(0).to(torch.int32).to(device)

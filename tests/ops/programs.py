@@ -58,10 +58,11 @@ def derivatives(run, tensors, orders=3):
     generator = torch.Generator().manual_seed(5)
     leaves = [tensor.clone().requires_grad_() for tensor in tensors]
     results = [list(run(*leaves))]
-    for _ in range(orders):
+    for order in range(1, orders + 1):
         total = 0 * leaves[0].sum()
         for tensor in results[-1]:
-            total = total + (tensor * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)).sum()
-        options = {"create_graph": True, "allow_unused": True, "materialize_grads": True}
+            factors = torch.randn(tensor.shape, generator=generator, dtype=torch.float64)
+            total = total + (tensor * factors.to(tensor)).sum()
+        options = {"create_graph": order < orders, "allow_unused": True, "materialize_grads": True}
         results.append(list(torch.autograd.grad(total, leaves, **options)))
     return [tensor.detach() for part in results for tensor in part]

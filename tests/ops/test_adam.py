@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 import torch
@@ -65,59 +66,56 @@ def test_what_was_found_before_leaves_out_a_step(device, backend):
         assert float(step) == 1 - found and bool((tensors[0][0] == 1).all()) == (found == 1)
 
 
-def test_refuses_what_would_be_read_out_of_bounds():
+def test_refuses_what_would_be_read_out_of_bounds(backend):
     """Each call has a single wrong argument."""
+    names = ("parameters", "gradients", "means", "squares")
 
     def call(rules=None, **changed):
-        arguments = {name: [torch.ones(())] for name in ("parameters", "gradients", "means", "squares")}
-        adam(rules or [UpdateRule(torch.zeros(()), 0.1)], **{**arguments, **changed})
+        arguments = {name: [torch.ones(())] for name in names}
+        adam(rules or [UpdateRule(torch.zeros(()), 0.1)], **{**arguments, **changed}, backend=backend)
 
     call()
-    rule = UpdateRule(torch.zeros(()), 0.1)
+    rule, one, loss = UpdateRule(torch.zeros(()), 0.1), torch.ones(()), {"loss": torch.ones(())}
     wrong = {
-        "adam: gradient must have shape [], got [2]": {"gradients": [torch.ones(2)]},
-        "adam: mean must have shape [], got [1]": {"means": [torch.ones(1)]},
-        "adam: square must have shape [], got [0]": {"squares": [torch.ones(0)]},
-        "adam: gradients must have length 1 like rules, got 2": {"gradients": 2 * [torch.ones(())]},
-        "adam: parameters must have length 1 like rules, got 0": {"parameters": []},
-        "adam: step must have shape [], got [1]": {"rules": [rule._replace(step=torch.zeros(1))]},
-        "adam: loss must come with a guard, got none": {"loss": torch.ones(())},
-        "adam: skip must have shape [], got [3]": {"guard": Guard(*torch.ones(3, 3))},
-        "adam: loss must have shape [], got [1]": {"guard": Guard.on("cpu"), "loss": torch.ones(1)},
-        "adam: epsilon must be positive, got 0.0": {"rules": [rule._replace(epsilon=0.0)]},
-        "adam: betas must lie in [0, 1), got (0.9, 1.0)": {"rules": [rule._replace(betas=(0.9, 1.0))]},
-        "adam: square must not be a negative view: clone it": {"squares": [torch._neg_view(torch.ones(()))]},
-    }
-    for message, changed in wrong.items():
-        with refused(ValueError, message):
-            call(**changed)
-    for message, changed in {
-        "adam: gradient must have dtype float32, got float64": {"gradients": [torch.ones((), dtype=torch.float64)]},
-        "adam: parameter must be a tensor, got float": {"parameters": [1.0]},
-        "adam: square must be a dense tensor, got a sparse_coo one": {"squares": [torch.ones(()).to_sparse()]},
-        "adam: step must be a tensor, got int": {"rules": [rule._replace(step=1)]},
-        "adam: step must be a dense tensor, got a sparse_coo one": {
-            "rules": [rule._replace(step=torch.zeros(()).to_sparse())]
-        },
-        "adam: rules[0] must be a UpdateRule, got tuple": {"rules": [tuple(rule)]},
-        "adam: guard must be a Guard, got Tensor": {"guard": torch.ones(())},
-        "adam: learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},
-        "adam: betas must be a number, got Tensor": {"rules": [rule._replace(betas=(0.9, torch.tensor(0.9)))]},
+        "gradient must have shape [], got [2]": {"gradients": [torch.ones(2)]},
+        "mean must have shape [], got [1]": {"means": [torch.ones(1)]},
+        "square must have shape [], got [0]": {"squares": [torch.ones(0)]},
+        "gradients must have length 1 like rules, got 2": {"gradients": 2 * [one]},
+        "parameters must have length 1 like rules, got 0": {"parameters": []},
+        "step must have shape [], got [1]": {"rules": [rule._replace(step=torch.zeros(1))]},
+        "step must have shape [], got [0]": {"rules": [rule._replace(step=torch.zeros(0))]},
+        "learning_rate must have shape [], got [0]": {"rules": [rule._replace(learning_rate=torch.ones(0))]},
+        "skip must have shape [], got [3]": {"guard": Guard(*torch.ones(3, 3))},
+        "skipped must have shape [], got [0]": {"guard": Guard(one, *[torch.ones(0)] * 2), **loss},
+        "loss must have shape [], got [1]": {"guard": Guard.on("cpu"), "loss": torch.ones(1)},
+        "epsilon must be positive, got 0.0": {"rules": [rule._replace(epsilon=0.0)]},
+        "betas must lie in [0, 1), got (0.9, 1.0)": {"rules": [rule._replace(betas=(0.9, 1.0))]},
+        "square must not be a negative view: clone it": {"squares": [torch._neg_view(one)]},
+        "gradient must have dtype float32, got float64": {"gradients": [one.double()]},
+        "parameter must be a tensor, got float": {"parameters": [1.0]},
+        "square must be a dense tensor, got a sparse_coo one": {"squares": [one.to_sparse()]},
+        "step must be a tensor, got int": {"rules": [rule._replace(step=1)]},
+        "step must be a dense tensor, got a sparse_coo one": {"rules": [rule._replace(step=one.to_sparse())]},
+        "skip must be a tensor, got NoneType": {"guard": Guard(None, None, None), **loss},
+        "rules[0] must be a UpdateRule, got tuple": {"rules": [tuple(rule)]},
+        "guard must be a Guard, got Tensor": {"guard": one},
+        "dense must be True or False, got int": {"rules": [rule._replace(dense=1)]},
+        "learning_rate must be a number, got str": {"rules": [rule._replace(learning_rate="x")]},
+        "betas must be a number, got Tensor": {"rules": [rule._replace(betas=(0.9, torch.tensor(0.9)))]},
         **{
-            f"adam: betas must be a pair of numbers, got {betas!r}": {"rules": [rule._replace(betas=betas)]}
+            f"betas must be a pair of numbers, got {betas!r}": {"rules": [rule._replace(betas=betas)]}
             for betas in (0.9, (0.9,), "ab")
         },
-    }.items():
-        with refused(TypeError, message):
+        "parameter must be contiguous, got strides (1, 2)": {name: [torch.ones(3, 2).t()] for name in names},
+        "gradient must have shape [4], got [3]": {
+            "rules": [rule, rule._replace(step=torch.zeros(()))],
+            **{name: [torch.ones(4), torch.ones(4)] for name in names},
+            "gradients": [torch.ones(4), torch.ones(3)],
+        },
+    }
+    for message, changed in wrong.items():
+        with refused(TypeError if re.search("dtype|must be (a |True)", message) else ValueError, f"adam: {message}"):
             call(**changed)
-    with refused(ValueError, "adam: parameter must be contiguous, got strides (1, 2)"):
-        turned = torch.ones(3, 2).t()
-        call(**{name: [turned] for name in ("parameters", "gradients", "means", "squares")})
-    two = [rule, rule._replace(step=torch.zeros(()))]
-    with refused(ValueError, "adam: gradient must have shape [4], got [3]"):
-        lists = [[torch.ones(4), torch.ones(4)] for _ in range(4)]
-        lists[1][1] = torch.ones(3)
-        adam(two, *lists)
 
 
 # --- entries without a gradient are left unchanged -----------------------------------------------------------------
@@ -187,23 +185,3 @@ def test_native_bits_depend_neither_on_threads_nor_on_instructions():
         torch.set_num_threads(threads)
     for tensors in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(tensors, results[0], strict=True))
-
-
-@pytest.mark.parametrize(
-    ("error", "message", "change"),
-    [
-        (TypeError, "skip must be a tensor, got NoneType", {"guard": Guard(None, None, None)}),
-        (ValueError, "skipped must have shape [], got [0]", {"guard": Guard(torch.ones(()), *[torch.ones(0)] * 2)}),
-        (TypeError, "dense must be True or False, got int", {"rules": [UpdateRule(torch.ones(()), 0.1, dense=1)]}),
-        (
-            ValueError,
-            "learning_rate must have shape [], got [0]",
-            {"rules": [UpdateRule(torch.ones(()), torch.ones(0))]},
-        ),
-        (ValueError, "step must have shape [], got [0]", {"rules": [UpdateRule(torch.ones(0), 0.1)]}),
-    ],
-)
-def test_forged_rules_and_guards_are_refused(error, message, change, backend):
-    arguments = {"rules": [UpdateRule(torch.ones(()), 0.1)], "guard": Guard.on("cpu"), "loss": torch.ones(()), **change}
-    with refused(error, f"adam: {message}"):
-        adam(arguments.pop("rules"), *([torch.ones(3)] for _ in range(4)), **arguments, backend=backend)

@@ -42,15 +42,8 @@ def slow(points, masses, centres, steps, alpha, nearby):
 @pytest.mark.parametrize(("k", "neighbours"), [(2, 8), (5, 2), (9, 8), (20, 8), (12, 1)])
 def test_equals_slow_loops(device, backend, k, neighbours):
     points, masses = samples(300)
-    result = balance_centres(
-        points.to(device),
-        masses.to(device),
-        points[:k].to(device),
-        steps=3,
-        alpha=0.3,
-        neighbours=neighbours,
-        backend=backend,
-    )
+    arguments = points.to(device), masses.to(device), points[:k].to(device)
+    result = balance_centres(*arguments, steps=3, alpha=0.3, neighbours=neighbours, backend=backend)
     centres, weights = slow(points, masses, points[:k], 3, 0.3, neighbours)
     torch.testing.assert_close(result[0].cpu(), centres, rtol=0, atol=2e-6)
     torch.testing.assert_close(result[1].cpu(), weights, rtol=1e-12, atol=1e-12)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import pytest
 import torch
 from op_cases import refusals
@@ -10,10 +12,11 @@ pytestmark = pytest.mark.op("cell_sort")
 
 
 def check(cells, k, order, offsets):
-    expected = sorted(range(len(cells)), key=lambda row: int(cells[row]))
+    keys = cells.tolist()
     assert order.dtype == offsets.dtype == torch.int32
-    assert order.tolist() == expected
-    assert offsets.tolist() == [int((cells < cell).sum()) for cell in range(k + 1)]
+    assert order.tolist() == sorted(range(len(keys)), key=keys.__getitem__)
+    keys.sort()
+    assert offsets.tolist() == [bisect_left(keys, cell) for cell in range(k + 1)]
 
 
 @pytest.mark.parametrize(("n", "k"), [*((333, k) for k in (1, 2, 7, 255, 256, 257, 40000)), (0, 1), (1, 7), (2, 40000)])
@@ -22,19 +25,9 @@ def test_is_the_stable_sort(device, backend, n, k):
     check(cells, k, *(part.cpu() for part in cell_sort(cells.to(device), k, backend=backend)))
 
 
-def test_empty_and_very_unequal_cells(device, backend):
+def test_very_unequal_cells(device, backend):
     cells = torch.tensor([5] * 700 + [0] + [5] * 3 + [8], dtype=torch.int32)
     check(cells, 10, *(part.cpu() for part in cell_sort(cells.to(device), 10, backend=backend)))
-    check(cells[:0], 3, *(part.cpu() for part in cell_sort(cells[:0].to(device), 3, backend=backend)))
-
-
-def test_round_trip():
-    cells = torch.randint(0, 9, (500,), dtype=torch.int32)
-    x = torch.rand(500, 3)
-    order, _ = cell_sort(cells, 9)
-    y = torch.empty_like(x)
-    y[order] = x[order]
-    assert torch.equal(y, x)
 
 
 def test_compiled_reference_keeps_stray_cells_apart():
@@ -53,4 +46,3 @@ def test_errors(backend):
     refuses = refusals(cell_sort, cells=cells, k=4, backend=backend)
     refuses("cells must lie in 0 to 2, got values from 0 to 3", k=3)
     refuses("cells must lie in 0 to 3, got values from -2 to 1", cells=cells - 2)
-    refuses("k must be an integer, got float", k=4.0)

@@ -4,7 +4,6 @@ import math
 
 import pytest
 import torch
-from composite_cases import dense, evaluate, scene
 from helpers import all_pairs
 from op_cases import FLOATS, need, offsets_of, strided
 from tolerances import assert_as_exact
@@ -51,6 +50,15 @@ def pack(tensors, counts):
     return tuple(torch.cat([tensor[ray, :count] for ray, count in enumerate(counts)]) for tensor in tensors)
 
 
+def composited(form, inputs, device, **options):
+    """Composites rays of equal length, as they are or packed."""
+    inputs = [tensor.to(device) for tensor in inputs]
+    if form == "packed":
+        options["ray_offsets"] = offsets_of([inputs[0].shape[1]] * len(inputs[0]), device)
+        inputs = [tensor.flatten(0, 1) for tensor in inputs]
+    return composite(*inputs, **options)
+
+
 SIZES = [(1, 1, 3), (5, 33, 3), (3, 64, 1), (2, 7, 5)]
 
 
@@ -60,14 +68,7 @@ def test_matches_a_slow_loop(device, backend, form, dtype, r, s, c):
     inputs = rays(r, s, c, dtype)
     background = torch.rand(r, c).to(dtype)
     exact = slow(*inputs, background=background)
-    ray_offsets = None if form == "dense" else offsets_of([s] * r, device)
-    arguments = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
-    actual = composite(
-        *(tensor.to(device) for tensor in arguments),
-        ray_offsets=ray_offsets,
-        background=background.to(device),
-        backend=backend,
-    )
+    actual = composited(form, inputs, device, background=background.to(device), backend=backend)
     for part, expected in zip(actual, exact):
         assert_as_exact(part.reshape(expected.shape), expected.to(dtype), expected)
 
@@ -118,9 +119,7 @@ def test_infinite_density_is_opaque_and_hides_what_follows(device, backend, form
     deltas = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.0, 1e30, 1.0, 1.0]])
     rgb, depths = torch.rand(2, 4, 3), torch.arange(8.0).reshape(2, 4)
     inputs = [tensor.to(device).requires_grad_() for tensor in (sigma, rgb, depths, deltas)]
-    arguments = inputs if form == "dense" else [tensor.flatten(0, 1) for tensor in inputs]
-    ray_offsets = None if form == "dense" else offsets_of([4, 4], device)
-    actual = composite(*arguments, ray_offsets=ray_offsets, backend=backend)
+    actual = composited(form, inputs, device, backend=backend)
     first = 1 - math.exp(-0.5)
     expected = torch.tensor([[first, 1 - first, 0, 0], [0, 1, 0, 0]])
     torch.testing.assert_close(actual.weights.reshape(2, 4).cpu(), expected, rtol=0, atol=1e-6)
@@ -134,9 +133,7 @@ def test_an_opaque_ray_costs_the_rays_behind_it_no_digits(device, backend, form)
     inputs = rays(40, 30)
     inputs[0][::2] = 1e30
     exact = slow(*inputs)
-    arguments = inputs if form == "dense" else tuple(tensor.flatten(0, 1) for tensor in inputs)
-    ray_offsets = None if form == "dense" else offsets_of([30] * 40, device)
-    actual = composite(*(tensor.to(device) for tensor in arguments), ray_offsets=ray_offsets, backend=backend)
+    actual = composited(form, inputs, device, backend=backend)
     torch.testing.assert_close(actual.weights.reshape(40, 30).double().cpu(), exact.weights, rtol=0, atol=1e-6)
 
 
@@ -150,11 +147,7 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend, form, wh
     results = []
     for inputs in (clean, spoiled):
         leaves = [tensor.to(device).requires_grad_() for tensor in inputs]
-        arguments = leaves if form == "dense" else [tensor.flatten(0, 1) for tensor in leaves]
-        ray_offsets = None if form == "dense" else offsets_of([6] * 5, device)
-        result = composite(
-            *arguments, ray_offsets=ray_offsets, background=torch.ones(3, device=device), backend=backend
-        )
+        result = composited(form, leaves, device, background=torch.ones(3, device=device), backend=backend)
         sum(part.sum() for part in result).backward()
         parts = [part.detach().reshape(5, -1) for part in result] + [leaf.grad.reshape(5, -1) for leaf in leaves]
         results.append(torch.cat(parts, dim=1).cpu())
@@ -165,25 +158,7 @@ def test_what_is_not_a_number_spoils_its_own_ray_alone(device, backend, form, wh
 
 @pytest.mark.parametrize("form", ["dense", "packed"])
 def test_a_spoiled_density_spoils_the_weights_from_there_on(device, backend, form):
-    sigma, rgb, depths, deltas = rays(1, 5)
-    sigma[0, 2] = NAN
-    inputs = (sigma, rgb, depths, deltas) if form == "dense" else (sigma[0], rgb[0], depths[0], deltas[0])
-    ray_offsets = None if form == "dense" else offsets_of([5], device)
-    weights = composite(*(tensor.to(device) for tensor in inputs), ray_offsets=ray_offsets, backend=backend).weights
+    inputs = rays(1, 5)
+    inputs[0][0, 2] = NAN
+    weights = composited(form, inputs, device, backend=backend).weights
     assert weights.flatten().isnan().tolist() == [False, False, True, True, True]
-
-
-@pytest.mark.parametrize("background", ["ray", "all", ""])
-def test_gradients_in_front_of_any_background(backend, background):
-    for arguments in (dense(4, 33, 3, background), scene([3, 0, 130, 1], 2, background, outside=(2, 5))):
-        exact, plain = (evaluate(arguments, dtype, "reference") for dtype in (torch.float64, torch.float32))
-        for actual, same, right in zip(evaluate(arguments, torch.float32, backend), plain, exact):
-            assert_as_exact(actual, same, right)
-
-
-@pytest.mark.parametrize("parts", [("colour",), ("opacity",), ("depth",), ("weights",), ("depth", "weights")])
-def test_gradients_of_some_outputs(backend, parts):
-    for arguments in (dense(4, 21), dense(4, 21, 2, "all"), scene([4, 0, 9])):
-        exact = evaluate(arguments, torch.float64, "reference", parts)
-        for actual, right in zip(evaluate(arguments, torch.float32, backend, parts), exact):
-            torch.testing.assert_close(actual.double(), right, rtol=1e-5, atol=1e-5)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from voronerf.ops import cell_sort, composite
-from voronerf.ops._core.declare import declared, tensor_rule
+from voronerf.ops._core.declare import declared
 
 
 def test_the_public_function_has_the_signature_and_the_docstring():
@@ -22,25 +22,6 @@ def test_the_public_function_has_the_signature_and_the_docstring():
         cell_sort(torch.zeros(1, dtype=torch.int32))
 
 
-def test_memory_follows_letters_arguments_and_dtypes():
-    op = declared("cell_sort")
-    order, offsets = op.allocate(op.Inputs(torch.zeros(5, dtype=torch.int32), 3))
-    assert order.shape == (5,) and offsets.shape == (4,) and offsets.dtype == torch.int32
-    sort = declared("nearest_centre")
-    assert sort.allocate(sort.Inputs(torch.zeros(5, 3).double(), torch.zeros(2, 3).double(), None)).dtype == torch.int32
-
-
-def test_letters_of_either_form():
-    op = declared("composite")
-    dense, packed = torch.zeros(2, 7), torch.zeros(14)
-    arguments = op.Inputs(dense, torch.zeros(2, 7, 3), dense, dense, None, None)
-    assert (arguments.r, arguments.s, arguments.c) == (2, 7, 3)
-    offsets = torch.tensor([0, 4, 9, 14], dtype=torch.int32)
-    arguments = op.Inputs(packed, torch.zeros(14, 3), packed, packed, offsets, torch.zeros(3))
-    assert (arguments.r, arguments.m, arguments.c, arguments.s) == (3, 14, 3, 0)
-    assert composite(*arguments[:4], ray_offsets=offsets, background=torch.zeros(3)).colour.shape == (3, 3)
-
-
 def test_a_struct_with_other_members_is_refused_at_once():
     kind = namedtuple("CellInputs", ["cells", "n", "threads"])
     op = declared("cell_sort")
@@ -51,11 +32,6 @@ def test_a_struct_with_other_members_is_refused_at_once():
         op.inputs(kind)
     cells = torch.zeros(5, dtype=torch.int32)
     assert op.inputs(kind, threads=lambda arguments: 2 * arguments.k)(op.Inputs(cells, 3)) == (cells, 5, 6)
-
-
-def test_what_is_no_shape_is_refused():
-    with pytest.raises(AssertionError, match="a tensor is written as dtypes and a shape, got 'floating n'"):
-        tensor_rule("points", "floating n")
 
 
 def test_arguments_are_bound_as_python_binds_them():

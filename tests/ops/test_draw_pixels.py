@@ -1,8 +1,10 @@
 """Tests that the pixels of a batch are drawn from runs, ranges of consecutive pixels."""
 
+import functools
+
 import pytest
 import torch
-from helpers import refuses
+from helpers import on_any_number_of_threads, refuses, same
 
 from voronerf.ops import draw_pixels as draw
 from voronerf.ops.draw_pixels.reference import KnownPixels, PixelRuns, draw_pixels
@@ -38,15 +40,10 @@ def test_native_draws_are_those_of_the_reference(name, count):
 
     runs = None if name is None else runs_of(*map(list, RUNS[name]))
     below = 10**9 if runs is None else runs.total
-    before = torch.get_num_threads()
-    for threads in (1, 3):
-        torch.set_num_threads(threads)
-        for several in (None, 0, count // 3, count):
-            known = None if several is None else KnownPixels(torch.arange(70, 80), torch.rand(10), several)
-            arguments = SEED, count, below, runs, known
-            for actual, expected in zip(drawn(*arguments), draw_pixels(*arguments), strict=True):
-                assert torch.equal(actual, expected)
-    torch.set_num_threads(before)
+    for several in (None, 0, count // 3, count):
+        known = None if several is None else KnownPixels(torch.arange(70, 80), torch.rand(10), several)
+        arguments = SEED, count, below, runs, known
+        assert same(on_any_number_of_threads(functools.partial(drawn, *arguments)), draw_pixels(*arguments))
 
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
@@ -73,33 +70,24 @@ def test_known_pixels_come_first_with_their_distances(backend):
     assert torch.equal(pixels[300:], others[0][300:]) and torch.equal(uniforms, others[1]) and not len(others[2])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"pixels": torch.zeros(2, dtype=torch.int64)}, "distances must have shape [p] with p = 2, got [3]"),
-        (
-            {"pixels": torch.zeros(0, dtype=torch.int64), "distances": torch.zeros(0)},
-            "known_pixels must hold at least one",
-        ),
-        ({"draws": 4}, "draws must be at most 3, got 4"),
-    ],
-)
-def test_known_pixels_are_checked(change, message):
-    known = KnownPixels(torch.tensor([1, 2, 3]), torch.rand(3), 2)._replace(**change)
-    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, known_pixels=known)
+EMPTY = {"pixels": torch.zeros(0, dtype=torch.int64), "distances": torch.zeros(0)}
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "change", "message"),
     [
-        ({"shift": torch.zeros(2, dtype=torch.int64)}, "shift must have shape [n] with n = 1, got [2]"),
-        ({"first": torch.zeros(0, dtype=torch.int32)}, "runs must hold at least one run, got none"),
-        ({"bits": 64}, "bits must be at most 48, got 64"),
-        ({"total": 9}, "below must be the 9 pixels of the runs, got 5"),
+        ("known_pixels", {"pixels": torch.zeros(2).long()}, "distances must have shape [p] with p = 2, got [3]"),
+        ("known_pixels", EMPTY, "known_pixels must hold at least one"),
+        ("known_pixels", {"draws": 4}, "draws must be at most 3, got 4"),
+        ("runs", {"shift": torch.zeros(2).long()}, "shift must have shape [n] with n = 1, got [2]"),
+        ("runs", {"first": torch.zeros(0).int()}, "runs must hold at least one run, got none"),
+        ("runs", {"bits": 64}, "bits must be at most 48, got 64"),
+        ("runs", {"total": 9}, "below must be the 9 pixels of the runs, got 5"),
     ],
 )
-def test_forged_runs_are_refused(change, message):
-    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, runs=runs_of([2], [5])._replace(**change))
+def test_forged_tables_are_refused(name, change, message):
+    tables = {"known_pixels": KnownPixels(torch.tensor([1, 2, 3]), torch.rand(3), 2), "runs": runs_of([2], [5])}
+    refuses(f"draw_pixels: {message}", draw, SEED, 3, 5, **{name: tables[name]._replace(**change)})
 
 
 def test_runs_that_do_not_fit_each_other_are_refused_where_they_are_made():

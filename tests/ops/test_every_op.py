@@ -52,16 +52,16 @@ def rows(runs):
     return pytest.mark.parametrize(("name", "backend", "device"), runs, indirect=["device"], ids=ids)
 
 
-every_op = rows(RUNS)
 FIRST = [run for run in RUNS if run[0].partition(", ")[2] == next(iter(CASES[run[0].partition(",")[0]].kinds))]
 # The compile test covers the first kind of each op; opcheck traces the custom ops for the other kinds. Schemas and fake
 # results are the same for all backends.
 first_kinds = rows([run if run[1] == "native" else pytest.param(*run, marks=pytest.mark.slow) for run in FIRST])
-custom_ops = rows([run for run in RUNS if run[1] == "native" or (run[1] != "reference" and run in FIRST)])
+# All networks are calls of one custom op. One network has an index of centres, as no other case has.
+LAYERS = ("grouped_linear", "grouped_mlp", "routed_mlp", "routed_program")
+CHECKED = [run for run in RUNS if run[0].partition(",")[0] not in LAYERS or run[0] == "routed_program, by an index"]
+custom_ops = rows([run for run in CHECKED if run[1] == "native" or (run[1] == "warp" and run in FIRST)])
 SMOOTH = [run for run in RUNS if CASES[run[0].partition(",")[0]].differentiable]
-smooth_op = rows(SMOOTH)
-natively = dict.fromkeys(name for name, backend, _ in RUNS if backend == "native")
-native_op = pytest.mark.parametrize("name", list(natively))
+native_op = pytest.mark.parametrize("name", dict.fromkeys(name for name, backend, _ in RUNS if backend == "native"))
 
 
 def prepare(name, backend, device, dtype=torch.float32):
@@ -128,7 +128,7 @@ def negated(tensor):
     return torch._neg_view(-tensor) if tensor.is_floating_point() else tensor
 
 
-@every_op
+@rows(RUNS)
 def test_any_view(device, backend, name):
     """Results depend on the values of the arguments, not on their memory layout."""
     run, tensors = prepare(name, backend, device)
@@ -139,19 +139,17 @@ def test_any_view(device, backend, name):
         assert_close(results(run, tree_map_only(Tensor, spread, arguments)), expected)
 
 
-@every_op
+@rows([run for run in RUNS if run[1] != "reference"])
 def test_any_size_gives_what_the_reference_gives(device, backend, name):
-    """The tolerance allows for the rounding of both backends; the tests of each op compare with float64."""
-    if backend == "reference":
-        pytest.skip("is what the others are compared with")
+    """The tolerance allows for the rounding of both backends; :func:`test_dtypes` compares with float64."""
     run, tensors = prepare(name, backend, device)
-    for n in (0, 1, 2, 15, 16, 17, 33, 257):
+    for n in (0, 1, 15, 16, 17, 33, 257):
         arguments = tensors(n)
         expected = results(functools.partial(run, backend="reference"), arguments)
         assert_close(results(run, arguments), expected)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64], ids=str)
+@pytest.mark.parametrize("dtype", FLOATS, ids=str)
 @rows([run for run in RUNS if run[1] != "reference" and run[0].partition(",")[0] not in SINGLE])
 def test_dtypes(device, backend, name, dtype):
     """Values and gradients have the reference's dtypes, and are as close to the float64 results as the reference's."""
@@ -164,8 +162,9 @@ def test_dtypes(device, backend, name, dtype):
         assert_as_exact(part, same, right) if same.is_floating_point() else torch.testing.assert_close(part, right)
 
 
+# The kinds of routed networks differ in how they find the cells, not in their gradients.
 @pytest.mark.parametrize(
-    "name", dict.fromkeys(run[0] for run in RUNS if CASES[run[0].partition(",")[0]].differentiable)
+    "name", dict.fromkeys(run[0] for run in SMOOTH if run in FIRST or not run[0].startswith("routed"))
 )
 def test_gradcheck(name):
     """First and second derivatives of the reference pass gradcheck in float64, along random directions."""
@@ -198,7 +197,7 @@ def test_autocast(device, backend, name):
     )
 
 
-@smooth_op
+@rows([run for run in SMOOTH if run[1] != "reference"])
 def test_only_the_gradients_asked_for(device, backend, name):
     """A gradient computed alone, from an expanded incoming gradient, equals the gradient computed with all others."""
     run, tensors = prepare(name, backend, device)
@@ -224,6 +223,32 @@ def test_only_the_gradients_asked_for(device, backend, name):
         leaf.requires_grad_()
     with torch.no_grad():
         assert not outputs()
+
+
+BENT = ["grouped_linear", "grouped_mlp", "grouped_mlp, integrated", "routed_mlp", "grouped_program, encoded"]
+BENT += ["frequency_encode", "integrated_encode", "spherical_harmonics", "composite, packed"]
+
+
+@rows([run for run in SMOOTH if run[0] in BENT and run[1] != "reference"])
+def test_a_loss_on_second_derivatives(device, backend, name):
+    """The gradients of a loss on second derivatives, such as a curvature, need third derivatives of the op."""
+    run, tensors = prepare(name, backend, device)
+    arguments = tensors(9)
+    wide = tree_map_only(Tensor, lambda tensor: tensor.double() if tensor.is_floating_point() else tensor, arguments)
+    options = {"allow_unused": True, "materialize_grads": True}
+
+    def gradients(arguments, **backend):
+        leaves = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor) and leaf.requires_grad]
+        smooth = [part for part in tree_leaves(run(arguments, **backend)) if part.requires_grad]
+        total = sum((part.flatten() * torch.linspace(-1, 1.5, part.numel()).to(part)).sum() for part in smooth)
+        slopes = torch.autograd.grad(total, leaves, create_graph=True, **options)
+        total = sum((slope * (1 + slope)).sum() for slope in slopes)
+        bends = torch.autograd.grad(total, leaves, create_graph=True, **options)
+        assert any(bend.requires_grad for bend in bends)
+        return torch.autograd.grad(sum(part.square().mean() for part in (*smooth, *slopes, *bends)), leaves, **options)
+
+    for actual, exact in zip(gradients(arguments), gradients(wide, backend="reference"), strict=True):
+        torch.testing.assert_close(actual.double(), exact, rtol=2e-3, atol=2e-4 * float(exact.abs().max()))
 
 
 @pytest.mark.native
@@ -315,7 +340,7 @@ def test_refuses(op, message):
     case = CASES[op]
     name, arguments = case.call or op, case.make(Draw(), 6)
     getattr(ops, name)(**arguments)
-    kinds = "an integer|an MLP|True|Cells|a (number|tensor|list|function|HashGrid|Network)"
+    kinds = "an integer|an MLP|True|Cells|a (number|tensor|list|function|HashGrid|Network|Program)"
     of_types = re.search(f"dtype|must be ({kinds})", message)
     with refused(TypeError if of_types else ValueError, f"{name}: {message}"):
         getattr(ops, name)(**{**arguments, **case.refused[message]})

@@ -13,7 +13,12 @@ from voronerf.ops._core.program import Program
 
 pytestmark = pytest.mark.op("grouped_linear")
 
-WIDTHS = [(1, 1), (63, 64), (90, 3), (3, 90)]
+# Each activation, then cells of each size, then each width with each dtype.
+CASES = [
+    *(("odd", 17, 9, activation, torch.float32) for activation in ACTIVATIONS),
+    *((counts, 17, 9, "sigmoid", torch.float32) for counts in COUNTS if counts != "odd"),
+    *(("odd", i, o, "none", dtype) for i, o in [(1, 1), (63, 64), (90, 3), (3, 90)] for dtype in FLOATS),
+]
 
 
 def layer(counts, i, o, dtype=torch.float32):
@@ -31,33 +36,18 @@ def results(linear, inputs, offsets, dtype, device, g, **options):
     return [y, *torch.autograd.grad(y, leaves, g.to(device, dtype))]
 
 
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-@pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
-def test_output_and_gradients_match_a_plain_loop(device, backend, counts, activation):
-    inputs, offsets = layer(counts, 17, 9), offsets_of(counts)
-    g = torch.randn(sum(counts), 9)
-    exact = results(loops.grouped_linear, inputs, offsets, torch.float64, torch.device("cpu"), g, activation=activation)
+@pytest.mark.parametrize(("counts", "i", "o", "activation", "dtype"), CASES)
+def test_output_and_gradients_match_a_plain_loop(device, backend, counts, i, o, activation, dtype):
+    need("grouped_linear", backend, device, dtype)
+    counts, cpu, options = COUNTS[counts], torch.device("cpu"), {"activation": activation}
+    inputs, offsets, g = layer(counts, i, o, dtype), offsets_of(counts), torch.randn(sum(counts), o).to(dtype)
+    exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g, **options)
     if activation == "relu":
         # Two correct float32 results may fall on either side of the kink.
         g = g * (exact[0] == 0).logical_or(exact[0] > 1e-4)
-    cpu = torch.device("cpu")
-    exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g, activation=activation)
-    plain = results(loops.grouped_linear, inputs, offsets, torch.float32, cpu, g, activation=activation)
-    actual = results(grouped_linear, inputs, offsets, torch.float32, device, g, activation=activation, backend=backend)
-    for part, same, right in zip(actual, plain, exact):
-        assert_as_exact(part, same, right)
-
-
-@pytest.mark.parametrize("dtype", FLOATS)
-@pytest.mark.parametrize(("i", "o"), WIDTHS)
-def test_dtypes_and_widths(device, backend, i, o, dtype):
-    need("grouped_linear", backend, device, dtype)
-    counts = COUNTS["odd"]
-    inputs, offsets, g = layer(counts, i, o, dtype), offsets_of(counts), torch.randn(sum(counts), o).to(dtype)
-    cpu = torch.device("cpu")
-    exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g)
-    plain = results(loops.grouped_linear, inputs, offsets, dtype, cpu, g)
-    actual = results(grouped_linear, inputs, offsets, dtype, device, g, backend=backend)
+        exact = results(loops.grouped_linear, inputs, offsets, torch.float64, cpu, g, **options)
+    plain = results(loops.grouped_linear, inputs, offsets, dtype, cpu, g, **options)
+    actual = results(grouped_linear, inputs, offsets, dtype, device, g, **options, backend=backend)
     for part, same, right in zip(actual, plain, exact):
         assert_as_exact(part, same, right)
 
@@ -73,57 +63,6 @@ def test_sums_over_many_samples_are_wide(device, backend, dtype):
     y.backward(torch.ones_like(y))
     # A sum of ones in a half type would stop growing at 256 or 2,048.
     assert weight.grad.item() == bias.grad.item() == torch.tensor(float(n), dtype=dtype).item()
-
-
-def test_without_bias(device, backend):
-    counts = COUNTS["odd"]
-    x, weight, _ = (tensor.to(device) for tensor in layer(counts, 5, 4))
-    offsets = offsets_of(counts, device)
-    actual = grouped_linear(x, offsets, weight, backend=backend)
-    expected = grouped_linear(x, offsets, weight, torch.zeros(len(counts), 4, device=device), backend=backend)
-    torch.testing.assert_close(actual, expected)
-
-
-def test_rows_of_no_cell_are_zero(device, backend):
-    x, weight, bias = (tensor.to(device).requires_grad_() for tensor in layer([3, 4, 5], 4, 2))
-    offsets = torch.tensor([2, 5, 9], dtype=torch.int32, device=device)
-    y = grouped_linear(x, offsets, weight[:2], bias[:2], activation="sigmoid", backend=backend)
-    assert (y[:2] == 0).all() and (y[9:] == 0).all() and (y[2:9] != 0).all()
-    y.sum().backward()
-    assert (x.grad[:2] == 0).all() and (x.grad[9:] == 0).all() and (x.grad[2:9] != 0).any()
-
-
-def test_what_is_not_a_number_stays_in_its_cell(device, backend):
-    counts = [4, 5, 6]
-    x, weight, bias = (tensor.to(device) for tensor in layer(counts, 4, 3))
-    x[6, 2], weight[1, 0, 1] = torch.nan, torch.inf
-    leaves = [tensor.requires_grad_() for tensor in (x, weight, bias)]
-    y = grouped_linear(leaves[0], offsets_of(counts, device), *leaves[1:], backend=backend)
-    y.sum().backward()
-    rows = [*range(4), *range(9, 15)]
-    assert y[rows].isfinite().all() and x.grad[rows].isfinite().all()
-    assert weight.grad[[0, 2]].isfinite().all() and bias.grad.isfinite().all()
-    assert not y[6].isfinite().any()
-
-
-@pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_second_derivatives_match_a_plain_loop(device, backend, activation):
-    counts = COUNTS["odd"]
-    offsets = offsets_of(counts)
-    inputs = layer(counts, 4, 3)
-
-    def penalty(linear, device, dtype, **options):
-        leaves = [tensor.to(device, dtype).requires_grad_() for tensor in inputs]
-        y = linear(leaves[0], offsets.to(device), *leaves[1:], activation=activation, **options)
-        slopes = torch.autograd.grad(y.square().sum(), leaves, create_graph=True)
-        return [
-            grad for slope in slopes for grad in torch.autograd.grad(slope.square().sum(), leaves, retain_graph=True)
-        ]
-
-    exact = penalty(loops.grouped_linear, torch.device("cpu"), torch.float64)
-    plain = penalty(loops.grouped_linear, torch.device("cpu"), torch.float32)
-    for part, same, right in zip(penalty(grouped_linear, device, torch.float32, backend=backend), plain, exact):
-        assert_as_exact(part, same, right)
 
 
 @pytest.mark.native

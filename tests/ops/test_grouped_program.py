@@ -78,24 +78,12 @@ def arguments(
 
 def derivatives(program: Program, rows: list, parameters: list, offsets: Tensor, backend: str, order=None) -> list:
     """Returns the results, their gradients, and the gradients of a weighted sum of these gradients."""
-    leaves = [t.clone().requires_grad_() for t in (*rows, *parameters)]
-    arguments = leaves[: len(rows)], leaves[len(rows) :]
-    results = grouped_program(*arguments, offsets, program=program, order=order, backend=backend)
-    generator = torch.Generator().manual_seed(5)
+    arguments = {"offsets": offsets, "program": program, "order": order, "backend": backend}
 
-    def weighted(tensors: list) -> Tensor:
-        parts = []
-        for t in tensors:
-            weights = torch.randn(t.shape, generator=generator, dtype=torch.float64).to(t.dtype)
-            if t.requires_grad:
-                parts.append((t * weights).sum())
-        return torch.stack(parts).sum() if parts else 0 * leaves[0].sum()
+    def run(*leaves: Tensor) -> list[Tensor]:
+        return grouped_program(leaves[: len(rows)], leaves[len(rows) :], **arguments)
 
-    firsts = torch.autograd.grad(
-        weighted(results), leaves, create_graph=True, allow_unused=True, materialize_grads=True
-    )
-    seconds = torch.autograd.grad(weighted(firsts), leaves, allow_unused=True, materialize_grads=True)
-    return [t.detach() for t in (*results, *firsts, *seconds)]
+    return of_every_order(run, [*rows, *parameters], 2)
 
 
 def check(
@@ -134,24 +122,30 @@ def test_derivative_of_every_function(name: str, order: int) -> None:
 
 
 FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38) for sign in (-1, 1)), 0.0, 88.5]
+SPECIAL = [
+    *((name, (1.0, 20.0), FAR) for name in ("exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu")),
+    *((name, (1.0, 20.0), FAR) for name in ("relu", "abs", "erf", "atan")),
+    ("clamp", (-1.0, 10.0), [*FAR, float("nan")]),
+    *(("power", (p,), [0.001, 0.3, 1.0, 1.5, 2.7, 0.0, -1.5]) for p in (0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0)),
+]
+"""Functions, their numbers, and arguments: very small and very large ones, 0, and the places of kinks. Powers may be
+integer, half-integer or others; their arguments are positive and negative numbers."""
 
 
 @pytest.mark.parametrize("order", range(4))
-@pytest.mark.parametrize(
-    "name", ["exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu", "clamp", "relu", "abs", "erf", "atan"]
-)
-def test_derivatives_far_away_and_at_borders(name: str, order: int) -> None:
-    """Derivatives are correct for very small and very large arguments, at 0, and near the kinks of a function."""
+@pytest.mark.parametrize(("name", "numbers", "values"), SPECIAL)
+def test_derivatives_of_special_numbers(name: str, numbers: tuple[float, ...], values: list, order: int) -> None:
     b = Builder()
-    columns = b.function(name, b.input(1), *{"clamp": (-1.0, 10.0)}.get(name, (1.0, 20.0)), order=order)
+    columns = b.function(name, b.input(1), *numbers, order=order)
     if columns is None:
+        assert name != "power"
         return
-    rows = torch.tensor([*FAR, float("nan")] if name == "clamp" else FAR)[:, None]
+    rows, program = torch.tensor(values)[:, None], b.program([columns])
     arguments = [], offsets_of([len(rows)])
-    (exact,) = grouped_program([rows.double()], *arguments, program=b.program([columns]), backend="reference")
+    (exact,) = grouped_program([rows.double()], *arguments, program=program, backend="reference")
     for isa in native.SUPPORTED_ISAS:
         with native.using_isa(isa):
-            (ours,) = grouped_program([rows], *arguments, program=b.program([columns]), backend="native")
+            (ours,) = grouped_program([rows], *arguments, program=program, backend="native")
         torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
 
 
@@ -183,22 +177,6 @@ def test_sums_spread_over_a_layer_and_products_with_relu() -> None:
     check(b.program([h, gated]), [97, 0, 30])
 
 
-@pytest.mark.parametrize("order", range(4))
-@pytest.mark.parametrize("power", [0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0])
-def test_powers(power: float, order: int) -> None:
-    """Integer, half-integer and other powers are correct for positive numbers, 0 and negative numbers."""
-    b = Builder()
-    columns = b.function("power", b.input(1), power, order=order)
-    assert columns is not None
-    rows = torch.tensor([0.001, 0.3, 1.0, 1.5, 2.7, 0.0, -1.5])[:, None]
-    arguments = [], offsets_of([len(rows)])
-    (exact,) = grouped_program([rows.double()], *arguments, program=b.program([columns]), backend="reference")
-    for isa in native.SUPPORTED_ISAS:
-        with native.using_isa(isa):
-            (ours,) = grouped_program([rows], *arguments, program=b.program([columns]), backend="native")
-        torch.testing.assert_close(ours, exact.float(), rtol=2e-5, atol=3e-7, equal_nan=True)
-
-
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("shared", [False, True])
 def test_every_step(sizes: list[int], shared: bool) -> None:
@@ -206,7 +184,7 @@ def test_every_step(sizes: list[int], shared: bool) -> None:
     check(every_step(), sizes, shared)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(24))
 def test_random_programs(seed: int) -> None:
     """Values, gradients and second derivatives of random programs are correct."""
     check(random_program(seed), [97, 0, 30])
@@ -263,18 +241,6 @@ def test_instruction_sets(isa: str) -> None:
         check(random_program(7), [97, 0, 30])
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_types(dtype: torch.dtype) -> None:
-    """Half-type results equal the float32 results for the same arguments, up to the rounding of products."""
-    program = random_program(3)
-    rows, parameters, offsets = arguments(program, [40, 9], dtype)
-    wide = [[t.float() for t in part] for part in (rows, parameters)]
-    for ours, exact in zip(
-        grouped_program(rows, parameters, offsets, program=program), grouped_program(*wide, offsets, program=program)
-    ):
-        assert agree(ours, exact.to(dtype))
-
-
 @pytest.mark.parametrize("backend", ["reference", "native"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("width", [1, 2, 33])
@@ -290,18 +256,6 @@ def test_one_column_in_the_place_of_all_is_put_out(width: int, dtype: torch.dtyp
     weight = torch.rand(60, 1).to(dtype)
     (slope,) = torch.autograd.grad(total, rows, weight)
     assert torch.equal(slope, weight.expand(-1, width))
-
-
-def test_refuses_what_is_no_program() -> None:
-    """Strings as programs and wrong offsets are refused; the op's case covers all other rules."""
-    with pytest.raises(TypeError, match="grouped_program: program must be a Program, got str"):
-        grouped_program([torch.ones(2, 2)], [], offsets_of([2]), program="x")  # type: ignore[arg-type]
-    rows, parameters, _ = arguments(every_step(), [6], torch.float32)
-    for offsets in ([0, 7], [0, 3, 2], [-1, 6]):
-        for backend in ("native", "reference"):
-            with pytest.raises(ValueError, match="grouped_program: offsets must ascend within 0 to"):
-                wrong = torch.tensor(offsets, dtype=torch.int32)
-                grouped_program(rows, [p[:1] for p in parameters], wrong, program=every_step(), backend=backend)
 
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
@@ -331,7 +285,6 @@ def test_a_spread_parameter_in_what_a_linear_step_adds_is_refused():
 
 def test_a_program_of_what_is_not_there_is_refused():
     """The constructor of Program refuses every number out of range, since the compiled module does not check."""
-    program = every_step()
 
     def larger(value):
         if isinstance(value, tuple):
@@ -342,25 +295,19 @@ def test_a_program_of_what_is_not_there_is_refused():
         elif type(value) is int:
             yield from (value + 100, -1, 2**31, 10**30)
 
-    taken = 0
-    for name in ("inputs", "parameters", "outputs", "steps"):
-        for other in larger(getattr(program, name)):
-            try:
-                replace(program, **{name: other})
-                taken += 1
-            except ValueError as error:
-                assert str(error).startswith("Program: ") and "\n" not in str(error)
-    assert taken == 4  # allowed: larger parameters with unread entries, and two steps with more columns, which are 0
+    def allowed(program):
+        for name in ("inputs", "parameters", "outputs", "steps", "sums", "rays", "by_ray"):
+            for other in larger(getattr(program, name)):
+                try:
+                    replace(program, **{name: other})
+                    yield name, other
+                except ValueError as error:
+                    assert str(error).startswith("Program: ") and "\n" not in str(error)
+
+    assert len([*allowed(every_step())]) == 4  # larger parameters with unread entries, and two steps with zero columns
     program = gradient(gradient(encoded(), *ALL), (True,) * 5, (True,) * 3, (True,) * 3, (True,) * 3)
     assert {"encode", "scatter"} <= {step.op for step in program.steps}
-    kept = []
-    for name in ("inputs", "parameters", "outputs", "steps", "sums", "rays", "by_ray"):
-        for other in larger(getattr(program, name)):
-            try:
-                replace(program, **{name: other})
-                kept.append((name, other))
-            except ValueError as error:
-                assert str(error).startswith("Program: ") and "\n" not in str(error)
+    kept = [*allowed(program)]
     steps = [new for name, other in kept if name == "steps" for new, old in zip(other, program.steps) if new != old]
     assert not any(step.op in ("encode", "scatter") for step in steps)
 
@@ -414,8 +361,7 @@ def encoding_arguments(program: Program, kind: str, sizes: list[int], rays: int)
     return tensors
 
 
-@pytest.mark.parametrize("ordered", [False, True], ids=["sorted", "in any order"])
-@pytest.mark.parametrize("ray", [False, True], ids=["of samples", "of rays"])
+@pytest.mark.parametrize(("ray", "ordered"), [(False, False), (False, True), (True, True)])
 @pytest.mark.parametrize("kind", ENCODED)
 def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None:
     """Values and three orders of gradients are correct: with autograd of the reference, and with gradient programs."""
@@ -453,20 +399,6 @@ def test_encodings_against_autograd(kind: str, ray: bool, ordered: bool) -> None
     for run in (by_reference, by_programs):
         for actual, exact in zip(of_every_order(run, tensors), expected, strict=True):
             torch.testing.assert_close(actual, exact, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", [*ENCODINGS, "hash", "hash of each cell"])
-def test_gradient_programs_of_encodings_by_differences(kind: str) -> None:
-    """Gradient programs pass gradcheck and gradgradcheck, which use finite differences."""
-    program = of_encoding(kind)
-    tensors = [tensor.requires_grad_() for tensor in encoding_arguments(program, kind, [2, 1], 3)]
-    ray_index = torch.arange(8).int() % 3
-
-    def run(*leaves: Tensor) -> tuple[Tensor, ...]:
-        return ByPrograms.apply(program.text, offsets_of([2, 1]), None, ray_index, *leaves)
-
-    assert torch.autograd.gradcheck(run, tensors, fast_mode=True)
-    assert torch.autograd.gradgradcheck(run, tensors, fast_mode=True)
 
 
 @pytest.mark.native
@@ -548,28 +480,18 @@ def test_the_sum_of_a_shared_table_is_one(backend: str) -> None:
     inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
     for few in (1, 3):
         parameters = [torch.randn(few, *shape) for shape in program.parameters]
-        result = grouped_program(
-            inputs,
-            parameters,
-            offsets_of([3, 0, 4]),
-            program=program,
-            ray_index=torch.arange(n).int() % rays,
-            backend=backend,
-        )
+        arguments = {"program": program, "ray_index": torch.arange(n).int() % rays, "backend": backend}
+        result = grouped_program(inputs, parameters, offsets_of([3, 0, 4]), **arguments)
         assert [len(tensor) for tensor in result] == [n, n, rays, few, 3, 3]
 
 
-@pytest.mark.parametrize("what", ["rows", "rays", "nothing"])
-def test_programs_of_rays_of_no_size(what: str) -> None:
-    """Programs with per-ray inputs run without samples, and without rays."""
+@pytest.mark.parametrize("backend", ["reference", "native"])
+def test_programs_without_rays_run(backend: str) -> None:
     program = encoded()
-    n, rays = {"rows": (0, 3), "rays": (0, 0), "nothing": (0, 0)}[what]
-    inputs = [torch.rand(rays if i in program.rays else n, w) for i, w in enumerate(program.inputs)]
+    inputs = [torch.rand(0, w) for w in program.inputs]
     parameters = [torch.randn(2, *shape) for shape in program.parameters]
-    arguments = {"program": program, "ray_index": torch.zeros(n).int()}
-    for backend in ("reference", "native"):
-        result = grouped_program(inputs, parameters, offsets_of([0, 0]), **arguments, backend=backend)
-        assert [tensor.shape for tensor in result] == [(n, 3), (rays, 3)] and not any(t.any() for t in result)
+    arguments = {"program": program, "ray_index": torch.zeros(0).int(), "backend": backend}
+    assert [len(tensor) for tensor in grouped_program(inputs, parameters, offsets_of([0, 0]), **arguments)] == [0, 0]
 
 
 def test_high_derivatives_within_a_custom_op() -> None:
@@ -587,9 +509,8 @@ def test_high_derivatives_within_a_custom_op() -> None:
     torch.testing.assert_close(result[1], torch.cat([torch.zeros(5, 3), *second], dim=1))
 
 
-@pytest.mark.parametrize("dynamic", [None, True])
-def test_programs_of_rays_compile(dynamic: bool | None) -> None:
-    """The program compiles to one graph, also if the compiler makes integers symbolic (`dynamic`)."""
+def test_programs_of_rays_compile() -> None:
+    """The program compiles to one graph for any number of rays, although the compiler makes integers symbolic."""
     torch.compiler.reset()
     program = encoded()
     parameters = [torch.rand(1, *shape).requires_grad_() for shape in program.parameters]
@@ -597,7 +518,7 @@ def test_programs_of_rays_compile(dynamic: bool | None) -> None:
     def run(inputs: list[Tensor], ray_index: Tensor) -> list[Tensor]:
         return grouped_program(inputs, parameters, offsets_of([3, 6]), program=program, ray_index=ray_index)
 
-    compiled = torch.compile(run, fullgraph=True, dynamic=dynamic, backend="aot_eager")
+    compiled = torch.compile(run, fullgraph=True, dynamic=True, backend="aot_eager")
     for rays in (4, 5):
         inputs = [torch.rand(rays if i in program.rays else 9, w) for i, w in enumerate(program.inputs)]
         ray_index = torch.arange(9).int() % rays
@@ -621,7 +542,6 @@ def test_refuses_rays_that_do_not_fit() -> None:
 
     refused("ray_index must be given for a program with inputs of rays, got None", ray_index=None)
     refused("ray_index must have shape [n] with n = 6, got [5]", ray_index=index[1:])
-    refused("ray_index must have dtype int32, got int64", TypeError, ray_index=index.long())
     for wrong in (7, -1, 2**31 - 1, -(2**31)):
         strange = index.clone()
         strange[3] = wrong

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers import on_any_number_of_threads
+from helpers import all_pairs, on_any_number_of_threads
 from op_cases import offsets_of, refused
 
 from voronerf import MLP, HashGrid, Layer
@@ -16,12 +16,11 @@ GRIDS = {
     "odd": HashGrid(levels=3, features=1, log2_entries=12, base=3, finest=9),
     "wide": HashGrid(levels=5, features=8, log2_entries=10, base=8, finest=100, box=((-1, -1, -1), (2, 2, 2))),
 }
-grids = pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 own_tables = pytest.mark.parametrize("own", [False, True], ids=["shared", "own tables"])
 COUNTS = [5, 0, 130, 1]
 
 
-def table_of(grid, **options):
+def table_of(grid):
     """Returns a layer table with a layer on positions, a skip connection from positions, and a head with directions."""
     layers = (
         Layer(("positions",), 17, "relu"),
@@ -30,7 +29,7 @@ def table_of(grid, **options):
         Layer((1, "directions"), 3),
     )
     hashed = {"position_encoding": "hash", "grid": grid} if grid is not None else {}
-    return MLP(layers, (3, 2), direction_octaves=2, **hashed, **options)
+    return MLP(layers, (3, 2), direction_octaves=2, **hashed)
 
 
 def network(grid, own, device="cpu", dtype=torch.float32, k=4):
@@ -51,49 +50,35 @@ def inputs(n, device="cpu", dtype=torch.float32):
     return x.to(device, dtype), rays.to(device, dtype), index.to(device)
 
 
-@grids
-@own_tables
-@pytest.mark.op("grouped_mlp")
-def test_grouped_equals_encoding_and_network(device, backend, grid, own):
-    offsets, n = offsets_of(COUNTS, device), sum(COUNTS)
-    weights, biases, features = network(grid, own, device)
-    x, rays, index = inputs(n, device)
-    leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
-    arguments = {"directions": rays, "direction_index": index, "backend": backend}
-    actual = grouped_mlp(x, offsets, weights, biases, layers=table_of(grid), features=features, **arguments)
-    encoded = hash_encode(x, features, grid, cells=cells_of(offsets, x) if own else None, backend="reference")
-    expected = grouped_mlp(encoded, offsets, weights, biases, layers=table_of(None), **arguments)
-    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
-    g = torch.randn_like(actual)
-    for a, b in zip(torch.autograd.grad(actual, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-
-
-@grids
-@own_tables
-@pytest.mark.parametrize("where", ["centres", "cells", "one cell"])
+@pytest.mark.parametrize(
+    *all_pairs({"where": ["offsets", "centres", "cells", "one cell"], "name": GRIDS, "own": [False, True]})
+)
 @pytest.mark.op("routed_mlp")
-def test_routed_equals_grouped(device, backend, grid, own, where):
-    k = 1 if where == "one cell" else len(COUNTS)
+def test_equals_encoding_and_network(device, backend, where, name, own):
+    grid, k, n = GRIDS[name], 1 if where == "one cell" else len(COUNTS), sum(COUNTS)
     weights, biases, features = network(grid, own, device, k=k)
-    x, rays, index = inputs(90, device)
-    centres = torch.rand(k, 3, device=device)
-    cells = nearest_centre(x, centres)
+    x, rays, index = inputs(n, device)
+    centres, offsets = torch.rand(k, 3, device=device), offsets_of(COUNTS, device)
+    cells = cells_of(offsets, x) if where == "offsets" else nearest_centre(x, centres)
     leaves = [t.requires_grad_() for t in (x, rays, features, *weights, *biases)]
     arguments = {"directions": rays, "direction_index": index, "backend": backend}
-    place = {"centres": {"centres": centres}, "cells": {"cells": cells}, "one cell": {}}[where]
-    actual, _ = routed_mlp(x, weights, biases, layers=table_of(grid), features=features, **place, **arguments)
+
+    def run(positions, layers, place, **more):
+        if where == "offsets":
+            return grouped_mlp(positions, offsets, weights, biases, layers=layers, **more, **arguments)
+        return routed_mlp(positions, weights, biases, layers=layers, **place, **more, **arguments)[0]
+
+    place = {"centres": {"centres": centres}, "cells": {"cells": cells}}.get(where, {})
+    actual = run(x, table_of(grid), place, features=features)
     encoded = hash_encode(x, features, grid, cells=cells if own else None, backend="reference")
-    expected, _ = routed_mlp(encoded, weights, biases, layers=table_of(None), cells=cells, **arguments)
+    expected = run(encoded, table_of(None), {"cells": cells})
     torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
     g = torch.randn_like(actual)
     for a, b in zip(torch.autograd.grad(actual, leaves, g), torch.autograd.grad(expected, leaves, g), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
-@own_tables
-@pytest.mark.parametrize("kept", [0, 3, 40, 89])
-@pytest.mark.parametrize("where", ["cells", "one cell"])
+@pytest.mark.parametrize(*all_pairs({"own": [False, True], "kept": [0, 3, 40, 89], "where": ["cells", "one cell"]}))
 @pytest.mark.op("routed_mlp")
 def test_rows_without_a_gradient_teach_nothing(device, backend, own, kept, where):
     grid, k = GRIDS["plain"], 1 if where == "one cell" else len(COUNTS)
@@ -134,13 +119,11 @@ def test_second_derivatives(device, backend, own):
         assert (a.double() - b).norm() <= 1e-4 * b.norm()
 
 
-@own_tables
-@pytest.mark.op("grouped_mlp")
-def test_is_part_of_a_graph(device, backend, own):
+def test_is_part_of_a_graph(device):
     torch.compiler.reset()
-    offsets, (weights, biases, features) = offsets_of(COUNTS, device), network(GRIDS["plain"], own, device)
+    offsets, (weights, biases, features) = offsets_of(COUNTS, device), network(GRIDS["plain"], True, device)
     x, rays, index = inputs(sum(COUNTS), device)
-    arguments = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"]), "backend": backend}
+    arguments = {"directions": rays, "direction_index": index, "layers": table_of(GRIDS["plain"])}
 
     def run(x, features):
         return grouped_mlp(x, offsets, weights, biases, features=features, **arguments)
@@ -179,8 +162,3 @@ def test_errors():
     rule = 'MLP: grid must be set if and only if position_encoding is "hash", without position_octaves'
     with refused(ValueError, f"{rule}, got hash ..."):
         MLP((Layer(("positions",), 4),), (0,), position_encoding="hash")
-
-
-def test_a_table_with_a_grid_is_text():
-    table = table_of(GRIDS["wide"])
-    assert MLP.parse(table.text) == table

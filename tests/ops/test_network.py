@@ -17,10 +17,7 @@ pytestmark = pytest.mark.op("grouped_program")
 
 GRID = HashGrid(levels=2, features=2, log2_entries=10, finest=20)
 TABLE = MLP(
-    (Layer(("positions",), 8, "relu"), Layer((0, "directions"), 3)),
-    outputs=(1,),
-    position_encoding="hash",
-    grid=GRID,
+    (Layer(("positions",), 8, "relu"), Layer((0, "directions"), 3)), outputs=(1,), position_encoding="hash", grid=GRID
 )
 PROGRAM = TABLE.program(3, 2, None, (True, False), ray=True)
 
@@ -82,7 +79,10 @@ def composed(arguments):
 @pytest.mark.parametrize(("n", "k"), [(0, 3), (1, 1), (40, 1), (40, 3)])
 @pytest.mark.parametrize("backward", [False, True])
 def test_equals_its_parts(device, backend, n, k, backward):
-    arguments, expected = network(device, n, k), network(device, n, k)
+    assert_equals_its_parts(network(device, n, k), network(device, n, k), backend, backward)
+
+
+def assert_equals_its_parts(arguments, expected, backend, backward=False):
     loss = learn(arguments, backward=backward, backend=backend)
     wanted = composed(expected)
     assert loss.requires_grad != backward
@@ -181,14 +181,7 @@ def test_under_autocast(device, backend):
 def test_frozen_cells_and_the_rows_that_count(k, backend):
     """Frozen cells have no gradient; rows beyond the row count have neither gradient nor output."""
     more = {"frozen": torch.arange(k) == 1, "rows": torch.tensor([30], dtype=torch.int32)}
-    arguments, expected = {**network("cpu", k=k), **more}, {**network("cpu", k=k), **more}
-    loss = learn(arguments, backend=backend)
-    loss.backward()
-    wanted = composed(expected)
-    wanted.backward()
-    torch.testing.assert_close(loss.detach(), wanted.detach(), rtol=1e-4, atol=1e-5)
-    for actual, other in zip(parameters_of(arguments), parameters_of(expected), strict=True):
-        torch.testing.assert_close(actual.grad, other.grad, rtol=1e-4, atol=1e-4)
+    assert_equals_its_parts(*({**network("cpu", k=k), **more} for _ in range(2)), backend=backend)
 
 
 def test_is_once_differentiable(device, backend):
@@ -201,8 +194,7 @@ def test_is_once_differentiable(device, backend):
 
 def test_a_tape_gives_the_gradients_that_autograd_gives(device, backend):
     """Each gradient alone equals the gradient by autograd, and is None if it is unwanted."""
-    arguments, index = network(device), 0
-    out, _ = routed_mlp(**arguments, backend="reference")
+    arguments = network(device)
     leaves = [arguments["positions"], arguments["directions"], *parameters_of(arguments)]
     for leaf in leaves:
         leaf.requires_grad_()
@@ -225,36 +217,35 @@ def test_refuses_what_makes_no_sense(device, backend):
     arguments = network(device)
     parameters, inputs = parameters_of(arguments), [arguments["positions"], arguments["directions"]]
     cells, index = Cells(centres=arguments["centres"]), arguments["direction_index"]
-    sums, k = replace(PROGRAM, steps=PROGRAM.steps, sums=((3,),)), [p.detach() for p in parameters]
+    k = [parameter.detach() for parameter in parameters]
+
+    def fwd(parameters=k, program=PROGRAM, inputs=inputs, cells=cells, ray_index=index):
+        Network(program, parameters).fwd(inputs, cells, ray_index=ray_index)
+
+    other, places = torch.ones(2, 3, 10, device=device), ("cells", "centres", "rows", "frozen", "k")
     wrong = {
-        "program must be a Program, got str": lambda: Network("x", parameters),
-        "parameters must have 4 tensors, got 1": lambda: Network(PROGRAM, parameters[:1]),
-        "parameters must be a list, got Tensor": lambda: Network(PROGRAM, parameters[0]),
-        "inputs must be a list, got Tensor": lambda: Network(PROGRAM, parameters).fwd(inputs[0], cells),
-        "ray_index must be given for a program with inputs of rays, got None": lambda: Network(PROGRAM, parameters).fwd(
-            inputs, cells
-        ),
-        "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": lambda: Network(
-            PROGRAM, [k[0], torch.ones(2, 3, 10, device=device), *k[2:]]
-        ).fwd(inputs, cells, ray_index=index),
-        "parameters[0] must be a tensor, got str": lambda: Network(PROGRAM, ["x", *k[1:]]),
-        "k must be at least 1, got 0": lambda: Network(PROGRAM, k).fwd(inputs, Cells(k=0), ray_index=index),
-        "order must come with offsets, got no offsets": lambda: Network(PROGRAM, k).fwd(
-            inputs, Cells(order=index), ray_index=index
-        ),
+        "program must be a Program, got str": {"program": "x"},
+        "parameters must have 4 tensors, got 1": {"parameters": k[:1]},
+        "parameters must be a list, got Tensor": {"parameters": k[0]},
+        "inputs must be a list, got Tensor": {"inputs": inputs[0]},
+        "ray_index must be given for a program with inputs of rays, got None": {"ray_index": None},
+        "parameters[1] must have shape [k, 3, 10] with k = 3, got [2, 3, 10]": {"parameters": [k[0], other, *k[2:]]},
+        "parameters[0] must be a tensor, got str": {"parameters": ["x", *k[1:]]},
+        "k must be at least 1, got 0": {"cells": Cells(k=0)},
+        "order must come with offsets, got no offsets": {"cells": Cells(order=index)},
         **{
-            f"{name} must be None where offsets are given, got both": lambda name=name: Network(PROGRAM, k).fwd(
-                inputs, Cells(**{"offsets": index, name: index}), ray_index=index
-            )
-            for name in ("cells", "centres", "rows", "frozen", "k")
+            f"{name} must be None where offsets are given, got both": {
+                "cells": Cells(**{"offsets": index, name: index})
+            }
+            for name in places
         },
-        "program must have outputs [n, w], and inputs[0] with one row for each sample": lambda: Network(
-            sums, parameters
-        ).fwd(inputs, cells, ray_index=index),
+        "program must have outputs [n, w], and inputs[0] with one row for each sample": {
+            "program": replace(PROGRAM, sums=((3,),))
+        },
     }
-    for message, call in wrong.items():
+    for message, changed in wrong.items():
         with refused(TypeError if "must be a " in message else ValueError, f"Network: {message}"):
-            call()
+            fwd(**changed)
     raw, tape = forward(arguments, backend)
     loss, gradient = squares(raw)
     with refused(ValueError, "learn: loss must have shape [], got [40, 3]"):

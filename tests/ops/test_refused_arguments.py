@@ -60,14 +60,6 @@ def test_an_op_that_differentiates_inside_takes_inference_tensors(inside):
         assert torch.allclose(part, other, atol=1e-5)
 
 
-@pytest.mark.op("hash_encode")
-def test_cells_without_a_table_are_refused_by_every_backend(backend):
-    call = {**CASES["hash_encode"].make(Draw(0), 7)}
-    table, cells = torch.rand(2, *call["grid"].table_shape), torch.tensor([0, 1, 2, 0, 0, 0, 0], dtype=torch.int32)
-    message = "hash_encode: cells must lie in 0 to 1, got values from 0 to 2"
-    refuses(message, ops.hash_encode, call["positions"], table, call["grid"], cells=cells, backend=backend)
-
-
 def short_tuples(value):
     """Yields (description of the error, changed value) for named tuples in a value with fewer entries than fields."""
     if hasattr(value, "_fields"):
@@ -82,13 +74,7 @@ def short_tuples(value):
 
 
 @pytest.mark.parametrize(
-    ("op", "name"),
-    [
-        ("adam", "rules"),
-        ("adam", "guard"),
-        ("draw_pixels", "known_pixels"),
-        ("draw_pixels", "runs"),
-    ],
+    ("op", "name"), [("adam", "rules"), ("adam", "guard"), ("draw_pixels", "known_pixels"), ("draw_pixels", "runs")]
 )
 def test_named_tuples_with_fewer_entries_than_fields(op, name):
     """``tuple.__new__`` makes such tuples; reading the missing entries in C++ would crash."""

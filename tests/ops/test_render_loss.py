@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers import all_pairs
 from op_cases import offsets_of
 from tolerances import assert_as_exact
 
@@ -49,11 +50,12 @@ def evaluate(device, arguments, dtype, backend, hidden=0.0, activated=False):
     return [part.detach() for part in result]
 
 
+COUNTS = [[0], [1], [3, 0, 17, 1, 0], [15], [16], [33], [127], [128], [129], [300, 0, 1000], [7] * 150]
+
+
 @pytest.mark.parametrize(
-    "counts", [[0], [1], [3, 0, 17, 1, 0], [15], [16], [33], [127], [128], [129], [300, 0, 1000], [7] * 150]
+    *all_pairs({"counts": COUNTS, "outside": [(0, 0), (3, 2)], "activated": [False, True]}), ids=repr
 )
-@pytest.mark.parametrize("outside", [(0, 0), (3, 2)])
-@pytest.mark.parametrize("activated", [False, True])
 def test_is_activations_composite_and_squared_error(device, backend, counts, outside, activated):
     arguments = rays(counts, outside=outside)
     if activated:
@@ -63,22 +65,6 @@ def test_is_activations_composite_and_squared_error(device, backend, counts, out
     plain = evaluate(device, arguments, torch.float32, "reference", **of)
     for actual, same, right in zip(evaluate(device, arguments, torch.float32, backend, **of), plain, exact):
         assert_as_exact(actual, same, right)
-
-
-@pytest.mark.parametrize("hidden", [0.0, 0.3])
-def test_gradients_to_activated_values(device, backend, hidden):
-    """A colour's gradient is its weight times the ray's gradient; for raw outputs, times the activation's slope."""
-    raw, *rest = rays([40, 0, 3, 90])
-    values = torch.cat([torch.sigmoid(raw[:, :3]), SCALE * torch.nn.functional.softplus(raw[:, 3:])], 1)
-    slopes = torch.cat([values[:, :3] * (1 - values[:, :3]), SCALE * torch.sigmoid(raw[:, 3:])], 1)
-    *seen, of_values = evaluate(device, (values, *rest), torch.float32, backend, hidden, activated=True)
-    *same, of_raw = evaluate(device, (raw, *rest), torch.float32, backend, hidden)
-    for part, other in zip([*seen, of_values * slopes.to(of_values)], [*same, of_raw]):
-        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
-    ray = torch.repeat_interleave(rest[1].diff().to(device))
-    of_colours = 2 * (seen[1] - rest[2].to(seen[1])) / seen[1].numel()
-    expected = (seen[2][:, None] * of_colours[ray]) * (of_values[:, 3:] != 0)
-    torch.testing.assert_close(of_values[:, :3], expected, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("hidden", [0.0, 0.3])

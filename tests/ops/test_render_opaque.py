@@ -1,12 +1,10 @@
 """Tests of `render_opaque`: one operation for the rays of an image, against separate operations in waves."""
 
-import itertools
-
 import pytest
 import torch
 from cases import Draw
 from cases.render_opaque import CASE
-from helpers import on_any_number_of_threads
+from helpers import all_pairs, on_any_number_of_threads
 from op_cases import refused
 
 from voronerf import MLP, Layer
@@ -14,15 +12,19 @@ from voronerf.ops import Cells, Network, render_opaque
 
 pytestmark = pytest.mark.op("render_opaque")
 MOVED = ("origins", "directions", "near", "far")
-CHOICES = [
-    *itertools.product(
-        (0, 1, 33, 700), ("hashed", "as they are"), (1, 3), ("linear", "disparity"), ("softplus", "relu")
-    )
-]
+PLAIN = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
+GRID = torch.ones(2, 2, 2, dtype=torch.bool), torch.tensor([[-1.0] * 3, [1.0] * 3])  # occupied everywhere in a box
+CHOICES = {
+    "n": [700, 33, 1, 0],
+    "positions": ["hashed", "as they are"],
+    "cells": [1, 3],
+    "spacing": ["linear", "disparity"],
+    "density": ["softplus", "relu"],
+}
 
 
 @pytest.mark.native
-@pytest.mark.parametrize(("n", "positions", "cells", "spacing", "density"), CHOICES)
+@pytest.mark.parametrize(*all_pairs(CHOICES))
 def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, density):
     pins = {"positions": positions, "cells": cells, "spacing": spacing, "density": density}
     arguments = CASE.make(Draw(n, **pins), n)
@@ -35,12 +37,10 @@ def test_native_sees_what_the_reference_sees(n, positions, cells, spacing, densi
 @pytest.mark.parametrize("backend", ["reference", pytest.param("native", marks=pytest.mark.native)])
 def test_values_are_seen_as_they_are(backend):
     """Colours and densities are rendered unchanged, even values that no activation returns."""
-    program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
     origins, directions = torch.tensor([[0.0, 0, -2]]), torch.tensor([[0.0, 0, 1]])
     ray = origins, directions, torch.zeros(1), torch.full((1,), 4.0)
-    box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
-    network = Network(program, [torch.zeros(1, 4, 3), torch.tensor([[3.0, -2, 0.5, -0.25]])])
-    seen = render_opaque(*ray, occupied, box, 64, network, opaque=0.0, backend=backend)
+    network = Network(PLAIN, [torch.zeros(1, 4, 3), torch.tensor([[3.0, -2, 0.5, -0.25]])])
+    seen = render_opaque(*ray, *GRID, 64, network, opaque=0.0, backend=backend)
     opacity = -torch.tensor([0.5]).expm1()  # the density is -0.25 over a length of 2
     torch.testing.assert_close(seen.opacity, opacity)
     torch.testing.assert_close(seen.colour, opacity * torch.tensor([[3.0, -2, 0.5]]))
@@ -93,20 +93,18 @@ def test_leaps_over_empty_cells_find_the_same():
 
 def test_a_tree_of_diagrams_tells_the_cells():
     """Space is split in halves and one half again; each of the three networks has one colour."""
-    program = MLP((Layer(("positions",), 4),), outputs=(0,)).program(3, 0, None, (True,))
     colours = torch.tensor([[1.0, 0, 0, 9], [0, 1, 0, 9], [0, 0, 1, 9]])
-    network = Network(program, [torch.zeros(3, 4, 3), colours])
+    network = Network(PLAIN, [torch.zeros(3, 4, 3), colours])
     centres = torch.tensor([[-0.5, 0, 0], [0.5, 0, 0], [0.5, -0.5, 0], [0.5, 0.5, 0]])
     child_offsets, child = torch.tensor([0, 2, 4], dtype=torch.int32), torch.tensor([-1, 1, -2, -3], dtype=torch.int32)
     cells = Cells(centres=centres, child_offsets=child_offsets, child=child, depth=2)
     origins = torch.tensor([[-0.5, -0.5, -2], [0.5, -0.5, -2], [0.5, 0.5, -2]])
     ray = origins, torch.tensor([[0.0, 0, 1]]).expand(3, 3), torch.zeros(3), torch.full((3,), 4.0)
-    box, occupied = torch.tensor([[-1.0] * 3, [1.0] * 3]), torch.ones(2, 2, 2, dtype=torch.bool)
     for backend in ("auto", "reference"):
-        seen = render_opaque(*ray, occupied, box, 64, network, cells=cells, backend=backend)
+        seen = render_opaque(*ray, *GRID, 64, network, cells=cells, backend=backend)
         assert torch.equal(seen.colour.round(decimals=1), torch.eye(3)), backend
     with refused(ValueError, "render_opaque: depth must be the number of levels of the tree, got 1, which is too few"):
-        render_opaque(*ray, occupied, box, 64, network, cells=cells._replace(depth=1), backend="native")
+        render_opaque(*ray, *GRID, 64, network, cells=cells._replace(depth=1), backend="native")
 
 
 def test_other_networks_are_refused():

@@ -72,8 +72,13 @@ def slow(arguments, hidden=0.0, **rule):
     return torch.autograd.grad(loss, leaf)[0]
 
 
-@pytest.mark.parametrize("rule", [SCALED, ACTIVATED, {**SCALED, "hidden": 0.3}], ids=str)
-@pytest.mark.parametrize("names", [NAMES, *((name,) for name in NAMES), ()], ids="+".join)
+HIDDEN = {**SCALED, "hidden": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("names", "rule"),
+    [*(((name,), SCALED) for name in NAMES), ((), SCALED), *((NAMES, rule) for rule in (SCALED, ACTIVATED, HIDDEN))],
+)
 def test_equals_autograd_through_a_slow_loop(device, backend, names, rule):
     need("rendered_gradient", backend, device, torch.float32)
     activations = {name: value for name, value in rule.items() if name != "hidden"}

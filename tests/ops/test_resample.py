@@ -74,19 +74,19 @@ def test_converges_to_the_density(device, backend):
     assert depths.mean().item() == pytest.approx(0.25 * 0.5 + 0.75 * 3, abs=1e-3)
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_rays_without_weight_are_drawn_evenly_over_the_bins(device, backend, value):
-    weights = torch.full((1, 4), value, device=device)
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [
+        # Rays without weight are drawn evenly over the bins.
+        *(([value] * 4, [0.5, 1.5, 3.0, 6.0]) for value in (0.0, -1.0, math.nan, math.inf)),
+        ([math.nan, 1.0, -3.0, math.inf], [1.125, 1.375, 1.625, 1.875]),  # weights that are no weights count as zero
+        *(([value, value, 0.0, 0.0], [0.25, 0.75, 1.25, 1.75]) for value in (3e38, 1e-45)),  # the ends of float32
+    ],
+)
+def test_special_weights(device, backend, weights, expected):
     edges = torch.tensor([[0.0, 1.0, 2.0, 4.0, 8.0]], device=device)
-    depths = resample(weights, edges, 4, backend=backend)
-    torch.testing.assert_close(depths.cpu(), torch.tensor([[0.5, 1.5, 3.0, 6.0]]))
-
-
-def test_weights_that_are_no_weights_count_as_zero(device, backend):
-    weights = torch.tensor([[math.nan, 1.0, -3.0, math.inf]], device=device)
-    edges = torch.arange(5.0, device=device)[None]
-    depths = resample(weights, edges, 2, backend=backend)
-    torch.testing.assert_close(depths.cpu(), torch.tensor([[1.25, 1.75]]))
+    depths = resample(torch.tensor([weights], device=device), edges, 4, backend=backend)
+    torch.testing.assert_close(depths.cpu(), torch.tensor([expected]))
 
 
 def test_uniforms_at_and_beyond_the_ends(device, backend):
@@ -107,11 +107,3 @@ def test_errors():
     weights, edges = rays(4, 5)
     refuses = refusals(resample, weights=weights, edges=edges, count=3)
     refuses("weights must have at least one bin, got none", weights=weights[:, :0], edges=edges[:, :1])
-
-
-@pytest.mark.parametrize("scale", [3e38, 1e-45])
-def test_weights_at_the_ends_of_float32(backend, device, scale):
-    weights = torch.tensor([[scale, scale, 0.0, 0.0]], device=device)
-    edges = torch.arange(5.0, device=device)[None]
-    result = resample(weights, edges, 4, backend=backend).cpu()
-    torch.testing.assert_close(result, torch.tensor([[0.25, 0.75, 1.25, 1.75]]))

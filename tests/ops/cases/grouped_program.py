@@ -94,6 +94,7 @@ CASE = Case(
         "encoded, shared, in any order": {"program": "encoded", "shared": 1, "ordered": True},
     },
     refused={
+        "program must be a Program, got str": {"program": "x"},
         "inputs must have 2 tensors, got 0": {"inputs": []},
         "parameters must have 2 tensors, got 0": {"parameters": []},
         "inputs[0] must have shape [n, 5], got [6, 3]": {"inputs": [torch.ones(6, 3), torch.ones(6, 3)]},

@@ -50,10 +50,7 @@ CASE = Case(
         "of cells, with shared ones": {"by": "cells", "shared": True},
     },
     refused={
-        "centre_index requires centres, got no centres": {
-            "centres": None,
-            "centre_index": torch.zeros(1).int(),
-        },
+        "centre_index requires centres, got no centres": {"centres": None, "centre_index": torch.zeros(1).int()},
         "centres must have shape [k, 3] with k = 2, got [1, 3]": {"centres": torch.zeros(1, 3)},
         "parameters must have 3 tensors, got 0": {"parameters": []},
     },
