@@ -2,6 +2,7 @@
 
 import copy
 import io
+import math
 import pickle
 
 import pytest
@@ -12,7 +13,7 @@ from voronerf.diagram import VoronoiDiagram, uniform_centres
 
 
 def slow_locate(diagram, point):
-    """Descends the tables of a diagram with Python numbers; ties go to the first centre."""
+    """Descends the tables of a diagram with Python numbers; ties, and points not finite, go to the first centre."""
     offsets, child = diagram.child_offsets.tolist(), diagram.child.tolist()
     centres = diagram.centres.double().tolist()
     node = 0
@@ -42,7 +43,8 @@ def integer_points(n):
 
 
 def test_nested_locate_equals_a_slow_descent():
-    diagram, points = uneven_diagram(), integer_points(400)
+    diagram, points = uneven_diagram(), integer_points(403)
+    points[400], points[401], points[402, 1] = float("nan"), float("inf"), float("nan")
     assert (diagram.depth, diagram.num_cells) == (3, 10)
     other, _ = VoronoiDiagram(integer_points(4)).refine({1: integer_points(7)[4:]})
     for tree in (diagram, other):
@@ -59,17 +61,6 @@ def test_locate_keeps_leading_shapes_and_takes_any_layout_and_dtype():
     assert diagram.locate(torch.empty(5, 0, 3)).shape == (5, 0)
     for dtype in (torch.float16, torch.bfloat16, torch.float64):
         assert torch.equal(diagram.locate(points.to(dtype)), expected)
-
-
-def test_points_that_are_not_finite_stay_in_range():
-    diagram = uneven_diagram()
-    points = torch.full((3, 3), float("nan"))
-    points[1] = float("inf")
-    points[2, 0] = 0.0
-    cells = diagram.locate(points)
-    assert bool(((cells >= 0) & (cells < diagram.num_cells)).all())
-    drawn = diagram.sample_cell(points, temperature=1.0)
-    assert bool(((drawn >= 0) & (drawn < diagram.num_cells)).all())
 
 
 def test_refine_keeps_the_other_cells_and_puts_children_in_place_of_their_parent():
@@ -150,6 +141,7 @@ def test_refine_refuses_what_is_no_leaf():
     refuses("got -1", refine, {-1: two})
     refuses("each leaf once, got 1 twice", refine, {1: two, torch.tensor(1): two})
     refuses("at least one centre", refine, {1: torch.zeros(0, 3)})
+    refuses("children must have centres [k, 3], got [k, 2]", refine, {1: torch.zeros(2, 2)})
     refuses("", refine, {1.5: two}, error=TypeError)
 
 
@@ -237,19 +229,16 @@ def test_stochastic_assignment_draws_on_the_generators_device():
     assert drawn.device.type == "meta" and drawn.shape == (50,)
 
 
-@pytest.mark.parametrize(
-    ("k", "sides"), [(8, (2, 2, 2)), (27, (3, 3, 3)), (64, (4, 4, 4)), (12, (2, 2, 3)), (16, (4, 2, 2))]
-)
-def test_uniform_centres_of_a_cube_are_a_grid(k, sides):
-    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
-    axes = [(torch.arange(side) + 0.5) * 2 / side - 1 for side in sides]
-    expected = torch.cartesian_prod(*axes)
-    centres = uniform_centres(box, k)
+@pytest.mark.parametrize("sides", [(4,), (4, 4), (2, 2, 2, 2), (2, 2, 2), (3, 3, 3), (2, 2, 3), (4, 2, 2)])
+def test_uniform_centres_of_a_cube_are_a_grid(sides):
+    k, d = math.prod(sides), len(sides)
+    expected = torch.cartesian_prod(*[(torch.arange(side) + 0.5) * 2 / side - 1 for side in sides]).view(k, d)
+    centres = uniform_centres(torch.tensor([[-1.0] * d, [1.0] * d]), k)
     assert torch.allclose(torch.cdist(centres, expected).amin(1), torch.zeros(k), atol=1e-3)
     assert torch.unique(centres, dim=0).shape[0] == k
 
 
-@pytest.mark.parametrize("k", [1, 2, 5, 7, 11, 13, 100, 257])
+@pytest.mark.parametrize("k", [1, 2, 7, 13, 257])
 def test_uniform_centres_of_any_number_lie_apart_in_the_box(k):
     box = torch.tensor([[0.0, -1, 2], [4, 1, 2.5]])
     centres = uniform_centres(box, k)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from voronerf import VoronoiDiagram, balance, split_diagram, uniform_centres
+from voronerf import VoronoiDiagram, balance, split_diagram
 from voronerf.router import VoronoiRouter
 
 DIMENSIONS = [1, 2, 3, 4]
@@ -25,9 +25,10 @@ def nearest(points: Tensor, centres: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16])
-@pytest.mark.parametrize("k", [1, 2, 17])
-def test_locate(d: int, dtype: torch.dtype, k: int, generator: torch.Generator) -> None:
+@pytest.mark.parametrize(
+    ("k", "dtype"), [(1, torch.float32), (17, torch.float32), (17, torch.float64), (17, torch.float16)]
+)
+def test_locate(d: int, k: int, dtype: torch.dtype, generator: torch.Generator) -> None:
     diagram = VoronoiDiagram(torch.randint(-4, 5, (k, d), generator=generator).float())
     points = torch.randint(-4, 5, (11, 23, d), generator=generator).to(dtype)  # with ties
     result = diagram.locate(points)
@@ -55,8 +56,9 @@ def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
     diagram.centres.data.copy_(torch.rand(2500, d, generator=generator))  # the version counter stays
     assert is_right(diagram)
     assert torch.equal(diagram.locate(points.double()), diagram.locate(points))
-    compiled = torch.compile(diagram.locate, fullgraph=True, backend="eager")
-    assert torch.equal(compiled(points), diagram.locate(points))
+    if d == 3:
+        compiled = torch.compile(diagram.locate, fullgraph=True, backend="eager")
+        assert torch.equal(compiled(points), diagram.locate(points))
     assert diagram.to("meta").locate(points.to("meta")).shape == (200,)
     diagram = VoronoiDiagram(torch.rand(2500, d, generator=generator))
     other = VoronoiDiagram(torch.rand(3000, d, generator=generator))
@@ -89,12 +91,6 @@ def test_refine_split_draw_save_and_part(d: int, generator: torch.Generator) -> 
     assert bool((part.locate(points[cells == 20]) == 1).all())
 
 
-def test_uniform_centres() -> None:
-    assert uniform_centres(torch.tensor([[0.0], [4.0]]), 4).flatten().tolist() == [0.5, 1.5, 2.5, 3.5]
-    assert uniform_centres(torch.tensor([[0.0, 0], [1, 1]]), 16).unique(dim=0).shape == (16, 2)
-    assert uniform_centres(torch.tensor([[0.0] * 4, [1.0] * 4]), 16).unique(dim=0).shape == (16, 4)
-
-
 def test_from_points_draws_of_many_and_takes_any_shape(generator: torch.Generator) -> None:
     points = torch.rand(100, 400, 2, generator=generator)
     diagram = VoronoiDiagram.from_points(points, 16, generator=generator)
@@ -116,20 +112,6 @@ def test_from_points_takes_as_many_cells_as_distinct_points(generator: torch.Gen
         VoronoiDiagram.from_points(rare, 5, generator=generator)
 
 
-def test_what_does_not_fit_is_refused(generator: torch.Generator) -> None:
-    plane = VoronoiDiagram(torch.rand(4, 2, generator=generator))
-    with pytest.raises(ValueError, match=r"centres must have shape \[k, d\], d = 1 to 4, got \[4, 5\]"):
-        VoronoiDiagram(torch.rand(4, 5))
-    with pytest.raises(ValueError, match=r"locate: points must have shape \[..., 2\], got \[7, 3\]"):
-        plane.locate(torch.rand(7, 3))
-    with pytest.raises(ValueError, match=r"children must have centres \[k, 2\], got \[k, 3\]"):
-        plane.refine({0: torch.rand(2, 3)})
-    with pytest.raises(ValueError, match=r"points must have shape \[m, d\], d = 1 to 4, got \[9, 6\]"):
-        balance(torch.rand(9, 6), torch.ones(9), 2)
-    with pytest.raises(ValueError, match=r"points must have shape \[..., 2\], got \[50, 3\]"):
-        split_diagram(plane, torch.rand(50, 3), torch.ones(50), 2)
-
-
 @pytest.mark.parametrize("d", DIMENSIONS)
 @pytest.mark.parametrize("options", [{"way": "loop"}, {"way": "grouped"}, {"fuse": True}])
 def test_a_router_of_so_many_coordinates(d: int, options: dict[str, object], generator: torch.Generator) -> None:
@@ -139,8 +121,8 @@ def test_a_router_of_so_many_coordinates(d: int, options: dict[str, object], gen
     with torch.no_grad():
         for parameter in router.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=generator)
-    cells = nearest(points.reshape(-1, d), router.diagram.centres)
-    expected = torch.stack([router.cell(int(c))(x) for c, x in zip(cells, points.reshape(-1, d))])
+    cells, modules = nearest(points.reshape(-1, d), router.diagram.centres), [router.cell(i) for i in range(5)]
+    expected = torch.stack([modules[c](x) for c, x in zip(cells.tolist(), points.reshape(-1, d))])
     torch.testing.assert_close(router(points), expected.reshape(30, 20, 3))
     torch.testing.assert_close(router(points, coords=points.clone()), router(points))
     optimizer = torch.optim.Adam(router.parameters())
@@ -152,12 +134,3 @@ def test_a_router_of_so_many_coordinates(d: int, options: dict[str, object], gen
     again = VoronoiRouter(net, torch.zeros(1, d), coords=f"first{d}", **options)  # type: ignore[arg-type]
     again.load_state_dict(router.state_dict())
     torch.testing.assert_close(again(points), router(points))
-
-
-def test_coords_must_be_as_many_as_the_centres_have(generator: torch.Generator) -> None:
-    router = VoronoiRouter(nn.Linear(2, 1), torch.rand(4, 2, generator=generator), coords="first2")
-    with pytest.raises(ValueError, match=r"coords must have shape \[..., 2\], got \[9, 3\]"):
-        router(torch.rand(9, 2), coords=torch.rand(9, 3))
-    router.coords = "first3"
-    with pytest.raises(ValueError, match=r"coords='first3' of the first tensor.* must have shape \[..., 2\]"):
-        router(torch.rand(9, 4))

@@ -122,5 +122,6 @@ def test_bad_input_gets_one_clear_line():
         ({"k": 2, "centres": "grid"}, "centres must be one of balanced, random, uniform, centroidal, got 'grid'"),
     ):
         refuses(message, split_diagram, ROOT, points, importance, **arguments)
+    refuses("points must have shape [..., 3], got [6, 2]", split_diagram, ROOT, points[:, :2], importance, 2)
     refuses("split_diagram: importance must be finite", split_diagram, ROOT, points, importance / 0 * 0, 2)
     refuses("more cells than samples", split_diagram, ROOT, torch.zeros(0, 3), torch.zeros(0), 2)

@@ -11,7 +11,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from ops.foreign_fields import Heads
-from router_loop import uniform
+from router_loop import Built, uniform
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
@@ -23,8 +23,6 @@ def centres() -> Tensor:
 
 
 class Mixes(nn.Module):
-    """A module with a step that mixes samples between two linear layers."""
-
     def __init__(self, step: Callable[[Any, Tensor], Any], **parts: nn.Module) -> None:
         super().__init__()
         self.fc, self.out, self.step = nn.Linear(3, 4), nn.Linear(4, 4), [step]
@@ -90,8 +88,12 @@ WIDE: list[Callable[[Any, Tensor], Any]] = [
 ]
 
 
-@pytest.mark.parametrize("options", [{}, {"fuse": True}, {"way": "grouped"}, {"way": "loop"}], ids=str)
-@pytest.mark.parametrize("number", range(len(WIDE)))
+WAYS: list[dict[str, Any]] = [{"fuse": True}, {"way": "grouped"}, {"way": "loop"}]
+
+
+@pytest.mark.parametrize(
+    ("number", "options"), [*((i, {}) for i in range(len(WIDE))), *((1, way) for way in WAYS)], ids=str
+)
 def test_results_as_wide_as_the_batch_are_refused(number: int, options: dict[str, Any], centres: Tensor) -> None:
     """The sizes of the cells do not matter: equal cells would give results of equal width."""
     rule = r"module must treat samples one by one, but Mixes.forward returns \[41, .*\] for 41 samples and \[37, "
@@ -105,17 +107,6 @@ def test_results_as_wide_as_the_batch_are_refused(number: int, options: dict[str
         for cells in (torch.arange(count) % 4, torch.arange(count) % 3):
             with pytest.raises(TypeError, match=rule):
                 router(equal, cells=cells)
-
-
-def test_one_sample_may_share_arguments(centres: Tensor) -> None:
-    """With one sample, a table [1, f] cannot be told from an argument per sample."""
-
-    class Table(nn.Linear):
-        def forward(self, x: Tensor, table: Tensor) -> Tensor:
-            return super().forward(x) @ table.T
-
-    router, table = VoronoiRouter(Table(3, 4), centres, coords="first3"), torch.randn(1, 4)
-    assert router(uniform((1,)), table).shape == (1, 1)
 
 
 class Field(nn.Module):
@@ -208,6 +199,7 @@ MODULES: Errors = [
 OPTIONS: Errors = [
     (lambda: VoronoiRouter(Field(), torch.randn(8, 5)), ValueError, "centres must"),
     (lambda: routed(assignment="near"), ValueError, "assignment must be 'nearest' or 'stochastic', got 'near'"),
+    (lambda: routed(way="quick"), ValueError, "way must be 'fused', 'grouped' or 'loop', got 'quick'"),
     (lambda: routed(temperature=0), ValueError, "temperature must be positive, got 0"),
     (lambda: routed(layout="row"), ValueError, "layout must be 'rays' or 'flat', got 'row'"),
     (lambda: routed(backend="nativ"), ValueError, "backend must be auto, reference, native, warp, got 'nativ'"),
@@ -268,16 +260,11 @@ def test_wrong_use_says_what_is_wrong(call: Callable[[], Any], kind: type[Except
 
 
 def test_an_error_of_the_field_itself_is_shown(centres: Tensor) -> None:
-    class Picky(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.fc = nn.Linear(3, 2)
+    def picky(net: Any, x: Tensor) -> Tensor:
+        if x.shape[-1] != 3:
+            raise KeyError(f"wants three features, not {x.shape[-1]}")
+        return F.relu(net.fc(x))
 
-        def forward(self, x: Tensor) -> Tensor:
-            if x.shape[-1] != 3:
-                raise KeyError(f"wants three features, not {x.shape[-1]}")
-            return F.relu(self.fc(x))
-
-    router = VoronoiRouter(Picky(), centres, coords="first3")
+    router = VoronoiRouter(Built(picky, fc=(3, 2)), centres, coords="first3")
     with pytest.raises(KeyError, match="wants three features, not 7"):
         router(X)

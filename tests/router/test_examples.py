@@ -4,44 +4,30 @@ from __future__ import annotations
 
 import itertools
 import re
-import runpy
-import sys
 from pathlib import Path
 
 import pytest
+from helpers import script
 from ops.foreign_fields import EXAMPLES
 
 ELSEWHERE = ("nerf_pytorch_style", "poisson", "train")  # these scripts have tests of their own
 SCRIPTS = sorted(path for path in EXAMPLES.glob("*.py") if path.stem not in ELSEWHERE)
 
 
-def run(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", [str(path), *arguments])
-    monkeypatch.syspath_prepend(str(path.parent))  # as `python path` does
-    runpy.run_path(str(path), run_name="__main__")
-
-
-def test_there_is_a_script_for_each_codebase() -> None:
-    assert len(SCRIPTS) == 10
-
-
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_script(path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Runs the script, which compares its field before and after routing."""
-    run(path, monkeypatch)
-    assert re.search(r"\d+ (cells|modules in one router)", capsys.readouterr().out)
+def test_script(path: Path) -> None:
+    assert re.search(r"\d+ (cells|modules in one router)", script(path))
 
 
 SMALL = {"downscale": 5, "seconds": 1.5, "width": 16, "depth": 3, "rays": 256, "samples": 16, "views": 2, "lr": 0.01}
 
 
 @pytest.mark.parametrize("voronoi", [False, True], ids=["one network", "cells"])
-def test_training_loop(voronoi: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_training_loop(voronoi: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = itertools.count()
     monkeypatch.setattr("time.perf_counter", lambda: 0.03 * next(ticks))  # 0.03 seconds a step on any machine
     options = [f"--{name}={value}" for name, value in SMALL.items()]
-    run(EXAMPLES / "nerf_pytorch_style.py", monkeypatch, "builtin", *options, *["--voronoi"] * voronoi)
-    last = capsys.readouterr().out.splitlines()[-1]
+    last = script(EXAMPLES / "nerf_pytorch_style.py", "builtin", *options, *["--voronoi"] * voronoi).splitlines()[-1]
     result = re.fullmatch(r"(16 cells|one network) of width 16: (\d+) steps in (\d+) s, test PSNR ([\d.]+) dB", last)
     assert result is not None, last
     assert result[1] == ("16 cells" if voronoi else "one network")
@@ -54,11 +40,7 @@ def test_three_lines_are_changed() -> None:
 
 
 @pytest.mark.slow
-def test_conditions_on_faces_join_the_solutions_of_cells(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    errors = []
-    for more in ([], ["--alone"]):
-        run(EXAMPLES / "poisson.py", monkeypatch, "--cells=3", "--steps=700", *more)
-        errors.append(float(capsys.readouterr().out.split()[-1]))
+def test_conditions_on_faces_join_the_solutions_of_cells() -> None:
+    said = [script(EXAMPLES / "poisson.py", "--cells=3", "--steps=700", *more) for more in ([], ["--alone"])]
+    errors = [float(out.split()[-1]) for out in said]
     assert errors[0] < 0.06 and errors[1] > 3 * errors[0], errors

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import refuses
+from router_loop import masked_loop
 from torch import Tensor, nn
 
 from voronerf import MLP, Layer, NeRF, VoronoiRouter, frequency_encode
@@ -17,8 +19,6 @@ TABLE = MLP((Layer(("positions",), 6, "relu"), Layer((0,), 4)), outputs=(1,))
 
 
 class Said(nn.Module):
-    """Two layers and an activation."""
-
     def __init__(self, act: Any = torch.sigmoid) -> None:
         super().__init__()
         self.first, self.second, self.act = nn.Linear(3, 6), nn.Linear(6, 4), act
@@ -34,8 +34,6 @@ class Said(nn.Module):
 
 
 class Viewed(nn.Module):
-    """A layer whose weight is a view of the parameter."""
-
     def __init__(self) -> None:
         super().__init__()
         self.flat, self.bias = nn.Parameter(torch.rand(12)), nn.Parameter(torch.rand(4))
@@ -57,23 +55,11 @@ def make(field: nn.Module | None = None, **options: Any) -> VoronoiRouter:
     return router
 
 
-def loop(router: VoronoiRouter, *args: Tensor) -> tuple[Tensor, ...]:
-    """Returns the results of the cells' modules; each evaluates the samples of its cell."""
-    cells = router.assign(args[0])
-    parts = [router.cell(cell)(*(x[cells == cell] for x in args)) for cell in range(router.num_cells)]
-    parts = [part if isinstance(part, tuple) else (part,) for part in parts]
-    outputs = [torch.zeros(N, *result.shape[1:], dtype=result.dtype) for result in parts[0]]
-    for cell, part in enumerate(parts):
-        for out, own in zip(outputs, part, strict=True):
-            out[cells == cell] = own
-    return tuple(outputs)
-
-
 def agree(router: VoronoiRouter, *args: Tensor, **allowed: float) -> None:
     assert router.explain() == "forward: fused"
     result = router(*args)
     result = result if isinstance(result, tuple) else (result,)
-    for a, b in zip(result, loop(router, *args), strict=True):
+    for a, b in zip(result, masked_loop(router, *args), strict=True):
         assert a.dtype == b.dtype
         torch.testing.assert_close(a, b, **{"rtol": 1e-4, "atol": 1e-5, **allowed})
 
@@ -92,23 +78,12 @@ def test_views_of_parameters_follow_their_parameters(context: Any) -> None:
     assert router.module.flat.grad is not None
 
 
-def other_weight(router: VoronoiRouter) -> None:
-    router.module.second.weight = nn.Parameter(torch.randn(K, 4, 6))
-
-
-def other_layer(router: VoronoiRouter) -> None:
-    router.module.second = make().module.second
-
-
-def other_module(router: VoronoiRouter) -> None:
-    router.module = make().module
-
-
-def other_activation(router: VoronoiRouter) -> None:
-    router.module.act = router.module.activate = torch.tanh
-
-
-CHANGES = {change.__name__: change for change in (other_weight, other_layer, other_module, other_activation)}
+CHANGES: dict[str, Any] = {
+    "weight": lambda r: setattr(r.module.second, "weight", nn.Parameter(torch.randn(K, 4, 6))),
+    "layer": lambda r: setattr(r.module, "second", make().module.second),
+    "module": lambda r: setattr(r, "module", make().module),
+    "activation": lambda r: [setattr(r.module, name, torch.tanh) for name in ("act", "activate")],
+}
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -168,8 +143,6 @@ def test_parameters_of_other_dtypes(dtype: torch.dtype) -> None:
 
 
 class Scaled(Said):
-    """An activation with a parameter."""
-
     def __init__(self) -> None:
         super().__init__(None)
         self.scale = nn.Parameter(torch.tensor(2.0))
@@ -184,7 +157,7 @@ def test_each_cell_may_have_its_parameter_of_the_activation() -> None:
     router, x = make(Scaled()), torch.rand(N, 3)
     result = router(x)
     assert router.explain().startswith("forward: grouped") and len(router.module.scale.unique()) == K
-    torch.testing.assert_close(result, *loop(router, x))
+    torch.testing.assert_close(result, *masked_loop(router, x))
 
 
 def test_wide_positions_are_encoded_as_they_are() -> None:
@@ -222,8 +195,7 @@ def test_weight_norm_afterwards_is_refused() -> None:
     router = make()
     router(torch.rand(N, 3))
     torch.nn.utils.parametrizations.weight_norm(router.module.second)
-    with pytest.raises(TypeError, match="module must keep the parameters that it was wrapped with"):
-        router(torch.rand(N, 3))
+    refuses("module must keep the parameters that it was wrapped with", router, torch.rand(N, 3), error=TypeError)
 
 
 @pytest.mark.native
@@ -249,8 +221,7 @@ def test_refuses_what_is_no_program() -> None:
         def program(self, name: str) -> Any:
             raise AssertionError
 
-    with pytest.raises(TypeError, match="program of Nothing must give a CellProgram, got NoneType"):
-        make(Nothing())
+    refuses("program of Nothing must give a CellProgram, got NoneType", make, Nothing(), error=TypeError)
     with pytest.raises(ValueError, match=r"program of Turned must read positions, .* got reads \(1, 0\)"):
         make(Turned())
     router = make(Unrelated(), coords="first3")

@@ -17,13 +17,7 @@ from voronerf.router import VoronoiRouter
 
 
 @pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(3)
-
-
-@pytest.fixture
 def field() -> NeRF:
-    torch.manual_seed(0)
     return NeRF(width=10, depth=3, skips=(1,))
 
 
@@ -32,11 +26,9 @@ def samples(n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
 
 
 def trained(field: NeRF, generator: torch.Generator) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
-    """Returns a router of three cells after a few steps of Adam, and the optimiser, which has two parameter groups."""
+    """Returns a router of three cells after a few steps of Adam, and the optimiser."""
     router = VoronoiRouter(field, torch.randn(3, 3, generator=generator))
-    heads = [p for name, p in router.named_parameters() if "colour" in name]
-    rest = [p for name, p in router.named_parameters() if "colour" not in name]
-    optimizer = torch.optim.Adam([{"params": heads, "lr": 1e-2}, {"params": rest}], lr=1e-3)
+    optimizer = torch.optim.Adam(router.parameters(), lr=1e-3)
     for _ in range(3):
         rgb, sigma = router(*samples(50, generator))
         optimizer.zero_grad()
@@ -89,23 +81,20 @@ def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: to
     torch.testing.assert_close(field(positions, directions)[0], before)
 
 
-@pytest.mark.parametrize("kind", ["one", "flat", "nested", "many"])
+@pytest.mark.parametrize("kind", ["one", "flat", "nested"])
 def test_every_kind_of_diagram_equals_the_loop(kind: str, field: NeRF, generator: torch.Generator) -> None:
-    cells = {"one": 1, "many": 300}.get(kind, 4)  # for many centres, the diagram uses its index
-    diagram = VoronoiDiagram(torch.randn(cells, 3, generator=generator))
+    diagram = VoronoiDiagram(torch.randn(1 if kind == "one" else 4, 3, generator=generator))
     if kind == "nested":
         diagram, _ = diagram.refine({1: torch.randn(3, 3, generator=generator)})
     router = perturb(VoronoiRouter(field, diagram), generator)
     positions, directions = samples(50, generator)
     positions.requires_grad_()
-    (rgb, sigma), _ = masked_loop(router, router.diagram.locate(positions), [positions, directions])
-    result, density = router(positions, directions)
-    torch.testing.assert_close(result, rgb)
-    torch.testing.assert_close(density, sigma)
-    ours, theirs = (torch.autograd.grad(c.sum() + d.sum(), positions) for c, d in ((result, density), (rgb, sigma)))
+    result, expected = router(positions, directions), masked_loop(router, positions, directions)
+    torch.testing.assert_close(list(result), expected)
+    ours, theirs = (torch.autograd.grad(c.sum() + d.sum(), positions) for c, d in (result, expected))
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
     shifted, _ = router(positions, directions, coords=positions + 1)
-    assert torch.allclose(shifted, rgb) == (kind == "one")
+    assert torch.allclose(shifted, result[0]) == (kind == "one")
 
 
 def test_stochastic_assignment_is_for_training_only(field: NeRF, generator: torch.Generator) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import python, same, seeded
+from helpers import all_pairs, python, same, seeded
+from router_loop import tensors
 from torch import nn
 
 from voronerf import NeRF, VoronoiDiagram, VoronoiRouter
@@ -25,8 +26,6 @@ LEFT_OUT = (
 
 
 class Scaled(nn.Module):
-    """A field that makes a constant in each call, on the device of its positions."""
-
     def __init__(self):
         super().__init__()
         self.layers = nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 4))
@@ -49,9 +48,9 @@ def meta():
     torch.set_default_device(None)
 
 
-@pytest.mark.parametrize("way", ["fused", "fuse", "grouped", "loop"])
-@pytest.mark.parametrize("kind", ["nerf", "scaled"])
-@pytest.mark.parametrize("n", [40, 3000])
+@pytest.mark.parametrize(
+    *all_pairs({"way": ["fused", "fuse", "grouped", "loop"], "kind": ["nerf", "scaled"], "n": [40, 3000]})
+)
 def test_calls_with_another_default_device(meta, kind, way, n):
     positions, results = torch.rand(n, 3, generator=seeded(1)), []
     arguments = (torch.nn.functional.normalize(positions, dim=-1),) if kind == "nerf" else ()
@@ -59,12 +58,10 @@ def test_calls_with_another_default_device(meta, kind, way, n):
         for _ in range(3):
             x = positions.clone().requires_grad_()
             router.zero_grad()
-            outputs = router(x, *arguments)
-            outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+            outputs = tensors(router(x, *arguments))
             sum(output.square().sum() for output in outputs).backward()
         with torch.no_grad():
-            silent = router(positions, *arguments)
-        silent = silent if isinstance(silent, tuple) else (silent,)
+            silent = tensors(router(positions, *arguments))
         results.append([*outputs, x.grad, *silent, *(parameter.grad for parameter in router.parameters())])
         meta()
     assert same(*results)

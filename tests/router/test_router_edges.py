@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-import threading
 from typing import Any
 
 import pytest
 import torch
 import torch.utils.checkpoint
-from ops.foreign_kinds import TRUNCATED
+from helpers import refuses
+from router_loop import masked_loop, perturb
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiRouter
@@ -30,11 +29,8 @@ def centres(k: int = 4) -> Tensor:
     return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
 
 
-def close(actual: Tensor, expected: Tensor) -> None:
+def close(actual: Any, expected: Any) -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
-
-
-# Hooks ----------------------------------------------------------------------------------------------------------------
 
 
 def test_hooks_of_the_module_itself_run() -> None:
@@ -48,9 +44,6 @@ def test_hooks_of_the_module_itself_run() -> None:
     handle.remove()
     router.module.register_forward_pre_hook(lambda m, arguments: (arguments[0] + 1,))
     close(router(x), module(x + 1))
-
-
-# Fields with a layer table --------------------------------------------------------------------------------------------
 
 
 class Moved(NeRF):
@@ -71,18 +64,9 @@ def test_such_fields_as_the_renderer_calls_them() -> None:
     router = VoronoiRouter(field, centres())
     expected = field(x, rays, index)
     by_rule = VoronoiRouter(field, centres(), coords=lambda p, d, i: p.flip(-1))
-    arguments = {"directions": rays, "ray_index": index}
-    for actual in (
-        router(x, rays, index),
-        router(x, **arguments),
-        router(x, rays, ray_index=index),
-        by_rule(x, rays, index),
-    ):
-        for part, whole in zip(actual, expected, strict=True):
-            close(part, whole)
-    compiled = torch.compile(router, backend="eager")
-    for part, whole in zip(compiled(x, rays, index), expected, strict=True):
-        close(part, whole)
+    named = router(x, directions=rays, ray_index=index)
+    for actual in (router(x, rays, index), named, router(x, rays, ray_index=index), by_rule(x, rays, index)):
+        close(actual, expected)
 
 
 @pytest.mark.filterwarnings("ignore:.*runs cell by cell")
@@ -99,58 +83,39 @@ def test_hooks_and_weight_norm_of_a_field_with_a_table() -> None:
 
 
 @pytest.mark.parametrize("rule", ["function", "slice", "at the call"])
-def test_coords_of_a_field_with_a_table(rule: str) -> None:
+def test_coords_of_a_field_with_a_table(rule: str, generator: torch.Generator) -> None:
     """The ``coords`` rule decides the cell, not the position itself."""
     module = NeRF(width=16, depth=2, position_encoding="integrated") if rule == "slice" else NeRF(width=16, depth=2)
     x = samples()[:, :3]
     if rule == "slice":
         x = torch.cat((x, x.abs() * 1e-2), 1)
     where = {"function": lambda p, *_: p.flip(-1), "slice": slice(3, 6), "at the call": None}[rule]
-    router = VoronoiRouter(module, centres(), coords=where)
-    with torch.no_grad():
-        for parameter in router.module.parameters():
-            parameter += 0.2 * torch.randn_like(parameter)
+    router = perturb(VoronoiRouter(module, centres(), coords=where), generator)
     at = x[:, 3:] if rule == "slice" else x.flip(-1)
-    actual = router(x, directions(40), coords=at) if rule == "at the call" else router(x, directions(40))
+    actual = router(x, directions(40), coords=at if rule == "at the call" else None)
     cells = router.diagram.locate(at)
     assert cells.unique().numel() > 1 or rule == "slice"
-    for cell in cells.unique().tolist():
-        rows = cells == cell
-        for part, expected in zip(actual, router.cell(cell)(x[rows], directions(40)[rows]), strict=True):
-            close(part[rows], expected)
-
-
-# Arguments ------------------------------------------------------------------------------------------------------------
-
-
-class NamesCoords(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.net = network()
-
-    def forward(self, coords: Tensor) -> Tensor:
-        return self.net(coords)
+    close(list(actual), masked_loop(router, x, directions(40), cells=cells))
 
 
 def test_an_argument_that_is_called_coords() -> None:
-    module, x = NamesCoords(), samples()
+    class NamesCoords(nn.Linear):
+        def forward(self, coords: Tensor) -> Tensor:
+            return super().forward(coords)
+
+    module, x = NamesCoords(5, 3), samples()
     router = VoronoiRouter(module, centres(), coords="first3")
     for _ in range(3):
         close(router(coords=x), module(x))
         close(router(x), module(x))
-    with pytest.raises(ValueError, match="coords must name the positions"):
-        VoronoiRouter(module, centres())(coords=x)
-
-
-# Failures -------------------------------------------------------------------------------------------------------------
+    refuses("coords must name the positions", VoronoiRouter(module, centres()), coords=x)
 
 
 def test_a_backend_that_is_not_there_is_no_reason_for_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backends, "missing", lambda backend, device: "it is not here" if backend == "warp" else None)
     backends._choose_once.cache_clear()
     router = VoronoiRouter(network(), centres(), coords="first3", backend="warp")
-    with pytest.raises(BackendUnavailable, match="warp"):
-        router(samples())
+    refuses("warp", router, samples(), error=BackendUnavailable)
 
 
 def test_memory_that_ran_out_once_is_no_reason_for_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,45 +131,9 @@ def test_memory_that_ran_out_once_is_no_reason_for_a_loop(monkeypatch: pytest.Mo
     for function, error in ((full, torch.OutOfMemoryError), (full_cpu, RuntimeError)):
         with monkeypatch.context() as patched:
             patched.setattr(rules, "grouped_linear", function)
-            with pytest.raises(error, match="memory"):
-                router(x)
+            refuses("memory", router, x, error=error)
         close(router(x), expected)
         assert router.explain() == "forward: grouped"
-
-
-def test_state_that_is_loaded_in_inference_mode() -> None:
-    router, x = VoronoiRouter(network(), centres(), coords="first3"), samples()
-    other = VoronoiRouter(network(), centres(6), coords="first3")
-    expected = other(x)
-    with torch.inference_mode():
-        router.load_state_dict(other.state_dict())
-        for _ in range(3):
-            close(router(x), expected)
-    for _ in range(3):
-        close(router(x), expected)
-    with torch.inference_mode():
-        close(VoronoiRouter(other.cell(0), centres(), coords="first3")(x), other.cell(0)(x))
-
-
-def test_networks_traced_in_two_threads_leave_custom_functions_as_they_were() -> None:
-    before = torch.autograd.Function.apply
-    routers = [VoronoiRouter(TRUNCATED.make(), centres(), coords="first3", fuse=True)]
-    routers.append(copy.deepcopy(routers[0]))
-    x, results = torch.rand(60, 3), {}
-    start = threading.Barrier(2)
-
-    def call(i: int) -> None:
-        start.wait(20)
-        results[i] = routers[i](x)["sigma"]
-
-    threads = [threading.Thread(target=call, args=(i,)) for i in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    close(results[0], results[1])
-    close(results[0], routers[0].cell(0)(x)["sigma"])
-    assert torch.autograd.Function.apply == before
 
 
 def test_centres_go_where_the_module_is(device: torch.device) -> None:

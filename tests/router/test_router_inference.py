@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers import all_pairs
 from ops.foreign_fields import Heads
 from router_loop import masked_loop, tensors
 from torch import Tensor
@@ -98,7 +99,7 @@ def train(router: VoronoiRouter) -> None:
     for method in (*router.methods, "forward", *router.methods):
         results = tensors(getattr(router, method)(x))
         if router.num_cells < 50:
-            torch.testing.assert_close(results, masked_loop(router, router.assign(x), [x], method)[0])
+            torch.testing.assert_close(results, masked_loop(router, x, method=method))
         optimizer.zero_grad()
         torch.stack([result.square().sum() for result in results]).sum().backward()
         before = [parameter.detach().clone() for parameter in router.parameters()]
@@ -136,20 +137,16 @@ USES: dict[str, Callable[[VoronoiRouter], None]] = {
 }
 
 
-@pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("name", ROUTERS)
-def test_uses_after_inference_mode(name: str, change: str) -> None:
-    faults = []
-    for use, function in USES.items():
-        torch.manual_seed(0)
-        router = ROUTERS[name]()
-        with torch.inference_mode():
-            router = CHANGES[change](router)
-        try:
-            function(router)
-        except Exception as error:
-            faults.append(f"{use}: {error}")
-    assert not faults, f"{len(faults)} of {len(USES)}: {faults[0]}"
+NAMES, ROWS = all_pairs({"name": ROUTERS, "change": CHANGES, "use": USES})
+ROWS += [row for row in ((name, "call", use) for name in ROUTERS for use in USES) if row not in ROWS]
+
+
+@pytest.mark.parametrize(NAMES, ROWS)
+def test_uses_after_inference_mode(name: str, change: str, use: str) -> None:
+    router = ROUTERS[name]()
+    with torch.inference_mode():
+        router = CHANGES[change](router)
+    USES[use](router)
 
 
 @pytest.mark.parametrize("name", ["fused", "grouped"])

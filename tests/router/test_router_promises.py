@@ -1,40 +1,27 @@
-"""Options by which users make promises about a module (`fuse`, `share`, `layout`, `register`), and `explain`."""
+"""Options by which users make promises about a module (`fuse`, `share`, `layout`, `register`), ways and `explain`."""
 
 from __future__ import annotations
 
 import copy
 import math
 import pickle
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
 from ops.foreign_fields import skip_net
-from ops.foreign_kinds import ENCODED, PYTORCH, Scales, ngp, seen
+from ops.foreign_kinds import ENCODED, PYTORCH, Scales, seen
 from ops.foreign_rows import Case, Row
-from router_loop import masked_loop, perturb, tensors, uniform
+from router_loop import Built, masked_loop, perturb, tensors, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
 from voronerf.router import register
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(7)
-
-
 def centres(k: int = 6) -> Tensor:
     return torch.rand(k, 3, generator=torch.Generator().manual_seed(k)) * 2 - 1
-
-
-def equal_to_loop(router: VoronoiRouter, x: Tensor) -> None:
-    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x[:, :3]), [x])[0][0])
-
-
-# fuse -----------------------------------------------------------------------------------------------------------------
 
 
 class Rough(nn.Module):
@@ -61,40 +48,6 @@ def test_rounding_is_no_reason_for_a_loop(fuse: bool) -> None:
     torch.testing.assert_close(exact(x), exact.cell(0)(x), rtol=1e-4, atol=1e-5)
 
 
-class Forward(nn.Module):
-    """A module with a step between linear layers."""
-
-    def __init__(self, step: Callable[[Any, Tensor], Tensor]) -> None:
-        super().__init__()
-        self.a, self.b, self.step = nn.Linear(3, 8), nn.Linear(8, 2), [step]
-        self.norm, self.gain = nn.LayerNorm(8), nn.Parameter(torch.ones(8))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.b(self.step[0](self, F.relu(self.a(x))))
-
-
-@pytest.mark.parametrize(
-    ("step", "says"),
-    [
-        (lambda net, h: h + torch.rand_like(h), r"draws random numbers"),
-        (lambda net, h: F.dropout(h, 0.5), r"torch.nn.functional.dropout draws random numbers"),
-        (lambda net, h: h if h.max() > 0 else -h, r"has no row for each of 37 samples: it mixes or selects them"),
-        (lambda net, h: h if (h > 0).any() else -h, r"depends on values; write it with torch.where"),
-        (lambda net, h: torch.autograd.grad(h.sum(0)[None].sum(), h)[0], "no row for each"),
-    ],
-)
-def test_what_does_not_fuse_is_refused_with_its_line(step: Any, says: str) -> None:
-    router = VoronoiRouter(Forward(step), centres(), coords="first3", fuse=True)
-    before = torch.is_grad_enabled()
-    try:
-        with pytest.raises(
-            ValueError, match=r"VoronoiRouter: fuse=True needs a network that .* Forward.forward.*" + says
-        ):
-            router(uniform((50,)))
-    finally:
-        torch.set_grad_enabled(before)
-
-
 def test_fused_networks_follow_parameters(generator: torch.Generator) -> None:
     x = torch.rand(60, 15, generator=generator) * 2 - 1
     router = perturb(VoronoiRouter(skip_net(), centres(), coords="first3", fuse=True), generator)
@@ -111,18 +64,12 @@ def test_fused_networks_follow_parameters(generator: torch.Generator) -> None:
 
 
 def test_a_module_that_writes_into_its_argument_leaves_that_of_the_call_alone() -> None:
-    class Clamps(nn.Linear):
-        def forward(self, x: Tensor) -> Tensor:
-            return super().forward(x.view(-1, 3).clamp_(0.1, 0.5) + 1)
-
+    module = Built(lambda net, x: net.layer(x.view(-1, 3).clamp_(0.1, 0.5) + 1), layer=(3, 2))
     for fuse in (False, True):
-        router, x = VoronoiRouter(Clamps(3, 2), centres(), coords="first3", fuse=fuse), uniform((50,))
+        router, x = VoronoiRouter(module, centres(), coords="first3", fuse=fuse), uniform((50,))
         before, expected = x.clone(), router.cell(0)(x.clone())
         torch.testing.assert_close(router(x), expected)
         assert torch.equal(x, before) and router.explain() == f"forward: {'fused' if fuse else 'grouped'}"
-
-
-# share ----------------------------------------------------------------------------------------------------------------
 
 
 def test_shared_parameters_are_one_copy() -> None:
@@ -137,30 +84,19 @@ def test_shared_parameters_are_one_copy() -> None:
         router.load_cell(0, cell)
 
 
-# layout ---------------------------------------------------------------------------------------------------------------
+FLAT = {
+    "squeezes": lambda net, x, cam: net.fc(torch.cat([x, net.table(cam.squeeze())], -1)),  # as in old code
+    "flattens": lambda net, x, cam: net.fc(torch.cat([x, net.table(cam[..., 0])], -1)).reshape(-1, 3),
+}
 
 
-class Squeezes(nn.Module):
-    """A field that squeezes a camera number per sample, as in old code."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.table, self.fc = nn.Embedding(4, 2), nn.Linear(5, 3)
-
-    def forward(self, x: Tensor, cam: Tensor) -> Tensor:
-        return self.fc(torch.cat([x, self.table(cam.squeeze())], -1))
-
-
-class Flattens(Squeezes):
-    """A field that returns flat rows, one for each sample, for arguments of any shape."""
-
-    def forward(self, x: Tensor, cam: Tensor) -> Tensor:
-        return self.fc(torch.cat([x, self.table(cam[..., 0])], -1)).reshape(-1, 3)
-
-
-@pytest.mark.parametrize("make", [Squeezes, Flattens])
-def test_flat_is_for_modules_that_squeeze_or_flatten(make: type[nn.Module]) -> None:
-    module, x, cam = make(), uniform((9, 7)), torch.randint(0, 4, (9, 7, 1))
+@pytest.mark.parametrize("name", FLAT)
+def test_flat_is_for_modules_that_squeeze_or_flatten(name: str) -> None:
+    module, x, cam = (
+        Built(FLAT[name], table=nn.Embedding(4, 2), fc=(5, 3)),
+        uniform((9, 7)),
+        torch.randint(4, (9, 7, 1)),
+    )
     router = VoronoiRouter(module, centres(), coords="first3", layout="flat")
     torch.testing.assert_close(router(x, cam), module(x, cam).reshape(9, 7, 3))
     with pytest.raises((ValueError, RuntimeError)) as error:
@@ -171,16 +107,10 @@ def test_flat_is_for_modules_that_squeeze_or_flatten(make: type[nn.Module]) -> N
 @pytest.mark.filterwarnings("error:VoronoiRouter")
 @pytest.mark.parametrize("width", [41, 43, 37])
 def test_constants_of_as_many_rows_as_a_trial_has_samples(width):
-    class Waves(nn.Linear):
-        def forward(self, x: Tensor) -> Tensor:
-            return (torch.linspace(1, 2, width) * self.bias) * torch.sin(super().forward(x))
-
-    router, x = VoronoiRouter(Waves(3, width), centres(), coords="first3", way="grouped"), uniform((50,))
+    waves = Built(lambda net, x: torch.linspace(1, 2, width) * net.fc.bias * torch.sin(net.fc(x)), fc=(3, width))
+    router, x = VoronoiRouter(waves, centres(), coords="first3", way="grouped"), uniform((50,))
     torch.testing.assert_close(router(x), router.cell(0)(x))
     assert router.explain() == "forward: grouped"
-
-
-# explain, register and single batches ---------------------------------------------------------------------------------
 
 
 def test_explain_names_each_method_and_the_step_in_the_way() -> None:
@@ -208,8 +138,6 @@ def test_explain_names_each_method_and_the_step_in_the_way() -> None:
     assert forward.startswith("forward: cell by cell: torch.functional.cdist takes parameters, and has no rule")
     assert "test_router_promises.py:" in forward and "return torch.cdist(x, self.places)" in forward
     assert forward.partition("cell by cell: ")[2] in str(said[0].message)
-    with pytest.raises(AttributeError, match=r"colour"):
-        router.colour  # noqa: B018
 
 
 def test_explain_says_why_a_method_is_not_fused() -> None:
@@ -227,14 +155,6 @@ def test_explain_says_why_a_method_is_not_fused() -> None:
     assert shade.startswith("shade: grouped: not fused, since torch.rand_like draws random numbers (test_router_prom")
 
 
-def test_a_method_that_is_not_routed_names_the_remedy() -> None:
-    router = VoronoiRouter(ngp.NeRFNetwork(8, 4), centres(), coords="first3", methods=["density"])
-    with pytest.raises(
-        AttributeError, match=r"color of NeRFNetwork is not routed; pass methods=\['density', 'color'\]"
-    ):
-        router.color(uniform((4,)), uniform((4,)))
-
-
 def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
     x, wrongly = torch.rand(50, 7, generator=generator), seen("wrongly")
     with pytest.warns(UserWarning, match="wrongly takes parameters, and has no rule"):
@@ -242,10 +162,7 @@ def test_a_rule_of_ones_own_may_be_wrong(generator: torch.Generator) -> None:
     register(wrongly, lambda run, rows, factor: rows * run.rows_of(factor))
     wrong = perturb(VoronoiRouter(Scales(wrongly), centres(), coords="first3"), generator)
     with pytest.warns(UserWarning, match="gives other results than the loop over cells"):
-        equal_to_loop(wrong, x)
-
-
-# Resuming -------------------------------------------------------------------------------------------------------------
+        torch.testing.assert_close(wrong(x), masked_loop(wrong, x)[0])
 
 
 @pytest.mark.filterwarnings("ignore:VoronoiRouter")
@@ -299,9 +216,8 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
         router.load_state_dict(state)
     else:
         router.subdivide(3, points=x, weights=torch.ones(60))
-    with pytest.raises(
-        ValueError, match=rf"write router.{'load_state_dict' if way == 'load' else 'subdivide'}\(.*optimi"
-    ):
+    method = "load_state_dict" if way == "load" else "subdivide"
+    with pytest.raises(ValueError, match=rf"write router.{method}\(.*optimi"):
         optimizer.step(closure)
     router.load_state_dict(router.state_dict(), optimizer=optimizer)
     before = router.module.weight.detach().clone()
@@ -315,12 +231,82 @@ def test_an_optimiser_with_the_state_of_other_cells_says_what_to_write(make: Any
             router.load_state_dict(wrong)
 
 
-@pytest.mark.parametrize("width", [37, 74, 259, 1147])
+@pytest.mark.parametrize("width", [37, 74, 1147])
 def test_widths_that_are_numbers_of_samples_of_a_trace(width):
     """All widths are multiples of 37, and 1147 is 31 * 37; a trace tries 37 samples first, and 31 samples second."""
-    torch.manual_seed(0)
     field = nn.Sequential(nn.Linear(3, width), nn.LayerNorm(width), nn.SiLU(), nn.Linear(width, 4))
     router = VoronoiRouter(field, torch.rand(3, 3), coords="first3", fuse=True)
     x = torch.rand(50, 3)
     torch.testing.assert_close(router(x), field(x))
     assert router.explain() == "forward: fused"
+
+
+def network() -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 16), nn.ReLU(), nn.Linear(16, 4))
+
+
+@pytest.mark.parametrize(("way", "taken"), [(None, "fused"), ("grouped", "grouped"), ("loop", "cell by cell")])
+def test_the_first_possible_way_is_taken(way: Any, taken: str) -> None:
+    options: Any = {} if way is None else {"way": way}
+    router, x = VoronoiRouter(network(), centres(), coords="first3", fuse=True, **options), uniform((200,))
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0])
+    assert router.explain() == f"forward: {taken}"
+
+
+class Counts(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+        self.register_buffer("seen", torch.zeros(()))
+
+    def forward(self, x: Tensor) -> Tensor:
+        self.seen += 1
+        return self.net(x) + 0 * torch.rand_like(x[:, :1])
+
+
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_a_first_call_leaves_no_trace(requires_grad: bool) -> None:
+    router, x = VoronoiRouter(Counts(), centres(), coords="first3"), uniform((200,)).requires_grad_(requires_grad)
+    for count in (1, 2):
+        torch.manual_seed(3)
+        result, after = router(x), torch.get_rng_state()
+        torch.manual_seed(3)
+        torch.rand(200, 1)
+        assert torch.equal(after, torch.get_rng_state()) and router.module.seen == count
+        torch.testing.assert_close(result, masked_loop(router, x)[0])
+    assert router.explain() == "forward: grouped"
+    assert all(parameter.grad is None for parameter in router.parameters()) and x.grad is None
+
+
+TRIES = [0]
+
+
+class Half(nn.Module):
+    """A module that can run grouped only if no coordinate exceeds 1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = network()
+
+    def forward(self, x: Tensor) -> Tensor:
+        TRIES[0] += 1
+        if (x.abs() > 1).any():
+            return self.net(x.clamp(-1, 1)) * float(len(x) and x[0, 0].detach() > -100)
+        return self.net(x)
+
+
+@pytest.mark.filterwarnings("ignore:VoronoiRouter")
+def test_batches_that_cannot_be_grouped_are_tried_by_doubling() -> None:
+    router, near = VoronoiRouter(Half(), centres(), coords="first3"), uniform((60,)).clamp(-1, 1)
+    far = near * 3
+    router(near)
+    cells = len(router.diagram.locate(far).unique())
+    TRIES[0] = 0
+    for _ in range(64):
+        torch.testing.assert_close(router(far), masked_loop(router, far)[0])
+    assert 64 * cells < TRIES[0] <= 64 * 2 * cells + 10  # two loops (router, expected) and few others
+    for _ in range(80):
+        router(near)
+    TRIES[0] = 0
+    router(near)
+    assert TRIES[0] == 1  # grouped again

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from router_loop import masked_loop, uniform
+from router_loop import Built, masked_loop, uniform
 from torch import Tensor, nn
 
 from voronerf import VoronoiRouter
@@ -21,9 +21,6 @@ from voronerf import VoronoiRouter
 CENTRES = torch.rand(4, 3, generator=torch.Generator().manual_seed(1)) * 2 - 1
 WAYS: list[dict[str, Any]] = [{}, {"way": "loop"}, {"fuse": True}]
 every_way = pytest.mark.parametrize("options", WAYS, ids=str)
-
-
-# Hidden layers --------------------------------------------------------------------------------------------------------
 
 
 class Blocks(nn.Module):
@@ -51,22 +48,21 @@ KEPT: dict[str, Callable[[list[nn.Module]], Any]] = {
 }
 
 
-@every_way
-@pytest.mark.parametrize("keep", KEPT)
+@pytest.mark.parametrize(
+    ("keep", "options"), [*(("list", way) for way in WAYS), *((keep, WAYS[2]) for keep in list(KEPT)[1:])], ids=str
+)
 def test_layers_in_lists_train_for_each_cell(keep: str, options: dict[str, Any]) -> None:
-    torch.manual_seed(0)
     router = VoronoiRouter.from_modules([Blocks(KEPT[keep]) for _ in CENTRES], CENTRES, coords="first3", **options)
     optimizer = torch.optim.SGD(router.parameters(), 0.1)
     for _ in range(3):
         x = uniform((50,))
-        (expected,), modules = masked_loop(router, router.assign(x), [x])
-        actual = router(x)
+        modules = [router.cell(i) for i in range(4)]
+        actual, (expected,) = router(x), masked_loop(router, x, modules=modules)
         torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
         optimizer.zero_grad()
         actual.square().mean().backward()
         expected.square().mean().backward()
         for name, parameter in router.module.named_parameters():
-            assert parameter.grad is not None
             slopes = torch.stack([m.get_parameter(name).grad for m in modules])
             torch.testing.assert_close(parameter.grad, slopes, rtol=1e-3, atol=1e-4)
         optimizer.step()
@@ -76,15 +72,10 @@ def test_layers_in_lists_train_for_each_cell(keep: str, options: dict[str, Any])
     router.load_cell(1, cell)
     torch.testing.assert_close(router.cell(1)(x), cell(x))
     router.subdivide(2, points=uniform((200,)))
-    torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0], rtol=1e-4, atol=1e-5)
-
-
-# Kept results ---------------------------------------------------------------------------------------------------------
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0], rtol=1e-4, atol=1e-5)
 
 
 class Keeps(nn.Module):
-    """A module that keeps its results in a dict and in a list."""
-
     def __init__(self) -> None:
         super().__init__()
         self.net, self.outputs, self.inner = nn.Linear(3, 2), dict[str, Tensor](), {"lists": list[Tensor]()}
@@ -113,8 +104,6 @@ def test_a_module_that_keeps_results_in_containers(options: dict[str, Any]) -> N
 
 
 class Caches(nn.Linear):
-    """A layer with a table that its first call makes."""
-
     def __init__(self) -> None:
         super().__init__(3, 2)
         self.cache = dict[str, Tensor]()
@@ -131,12 +120,10 @@ def test_a_cache_that_the_first_call_fills_needs_no_warning(options: dict[str, A
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(2):
-            torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+            torch.testing.assert_close(router(x), masked_loop(router, x)[0])
 
 
 class Carries(nn.Linear):
-    """A layer that assigns a buffer, from which it reads in the next call."""
-
     def __init__(self) -> None:
         super().__init__(3, 2)
         self.register_buffer("calls", torch.zeros(()))
@@ -150,11 +137,8 @@ class Carries(nn.Linear):
 def test_an_assigned_buffer_does_not_reach_the_next_cell(options: dict[str, Any]) -> None:
     router, x = VoronoiRouter(Carries(), CENTRES, coords="first3", **options), uniform((40,))
     for _ in range(3):
-        torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+        torch.testing.assert_close(router(x), masked_loop(router, x)[0])
     assert router.module.calls == 0
-
-
-# Counters -------------------------------------------------------------------------------------------------------------
 
 
 class Counter(nn.Linear):
@@ -180,29 +164,19 @@ def test_a_schedule_that_forward_advances_warns_once_with_its_line(options: dict
         router(uniform((40,)))
 
 
-class Sized(nn.Linear):
-    def forward(self, x: Tensor) -> dict[str, Any]:
-        return {"y": super().forward(x), "sizes": [len(x), 2 * len(x), 37]}
-
-
 @every_way
 def test_a_result_that_counts_samples_counts_all_samples(options: dict[str, Any]) -> None:
-    router = VoronoiRouter(Sized(3, 2), CENTRES, coords="first3", **options)
+    sized = Built(lambda net, x: {"y": net.fc(x), "sizes": [len(x), 2 * len(x), 37]}, fc=(3, 2))
+    router = VoronoiRouter(sized, CENTRES, coords="first3", **options)
     for n in (50, 37, 41, 1, 0, 50):
         assert router(uniform((n,)))["sizes"] == [n, 2 * n, 37]
 
 
 def test_another_number_among_the_results_warns() -> None:
-    class Mean(nn.Linear):
-        def forward(self, x: Tensor) -> tuple[Tensor, float]:
-            return super().forward(x), float(x.detach().mean())
-
-    router = VoronoiRouter(Mean(3, 2), CENTRES, coords="first3")
+    mean = Built(lambda net, x: (net.fc(x), float(x.detach().mean())), fc=(3, 2))
+    router = VoronoiRouter(mean, CENTRES, coords="first3")
     with pytest.warns(UserWarning, match="returns a number in '.1' that depends on the samples of a cell"):
         router(uniform((40,)))
-
-
-# Modules that differ --------------------------------------------------------------------------------------------------
 
 
 class Sine(nn.Module):
@@ -275,14 +249,11 @@ def test_modules_that_keep_different_results_are_one_network_for_each_cell() -> 
         module.last = module(uniform((7,)))
     router = VoronoiRouter.from_modules(modules, CENTRES, coords="first3")
     x = uniform((9,))
-    torch.testing.assert_close(router(x), masked_loop(router, router.assign(x), [x])[0][0])
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0])
     cell = router.cell(1)
     with torch.no_grad():
         cell(x)  # leaves results without gradients
     router.load_cell(2, cell)
-
-
-# Containers that several submodules share -----------------------------------------------------------------------------
 
 
 class Block(nn.Module):
@@ -315,20 +286,15 @@ class Sharing(nn.Module):
 @every_way
 def test_submodules_that_share_a_container(options: dict[str, Any]) -> None:
     router = VoronoiRouter.from_modules([Sharing() for _ in CENTRES], CENTRES, coords="first3", **options)
-    with pytest.warns(
-        UserWarning, match="forward changes the items of Sharing.store, which are restored after the call"
-    ):
+    with pytest.warns(UserWarning, match="changes the items of Sharing.store, which are restored after the call"):
         router(uniform((40,)))
     for n in (40, 3):
         x = uniform((n,))
-        expected, _ = masked_loop(router, router.assign(x), [x])
+        expected = masked_loop(router, x)
         for actual, right in zip(router(x), expected, strict=True):
             torch.testing.assert_close(actual, right, rtol=1e-4, atol=1e-5)
     assert router.module.store.keys() == {"losses", "steps", "self"} and router.module.store["steps"] == 0
     assert router.module.store["self"] is router.module.blocks[1].store is router.module.store
-
-
-# A forward that changes between calls ---------------------------------------------------------------------------------
 
 
 class Turning(nn.Module):
@@ -361,7 +327,7 @@ def test_steps_of_other_paths_are_recorded_and_compared_with_the_loop() -> None:
             (1, False, 50),
         ):
             router.module.dim, router.module.joined, x = dim, joined, uniform((n,))
-            expected, _ = masked_loop(router, router.assign(x), [x])
+            expected = masked_loop(router, x)
             torch.testing.assert_close(router(x), expected[0], rtol=1e-4, atol=1e-5)
 
 
@@ -397,5 +363,5 @@ def test_a_number_that_is_an_index_is_followed(name: str) -> None:
     router = VoronoiRouter.from_modules([Masked(INDICES[name]) for _ in CENTRES], CENTRES, coords="first3", fuse=True)
     for bands in (2, 3, 5, 8, 4, 6, 7):
         router.module.bands, x = bands, uniform((30,))
-        expected, _ = masked_loop(router, router.assign(x), [x])
+        expected = masked_loop(router, x)
         torch.testing.assert_close(router(x), expected[0], rtol=1e-4, atol=1e-5)

@@ -9,16 +9,12 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from router_loop import masked_loop
+from helpers import refuses
+from router_loop import Built, masked_loop
 from torch import Tensor, nn
 
 from voronerf import NeRF, VoronoiDiagram
 from voronerf.router import VoronoiRouter
-
-
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(3)
 
 
 def net(features: int = 3) -> nn.Module:
@@ -31,12 +27,7 @@ def router_of(module: nn.Module, generator: torch.Generator, k: int = 8, **optio
     )
 
 
-# Initialisation -------------------------------------------------------------------------------------------------------
-
-
 class Field(nn.Module):
-    """A field with an encoder, a table, a layer with weight norm, and a buffer."""
-
     def __init__(self) -> None:
         super().__init__()
         self.encoder, self.table = nn.Linear(3, 16), nn.Embedding(10, 16)
@@ -83,19 +74,13 @@ def test_apply_with_shared_parameters_buffers_and_parametrizations(generator: to
     assert not torch.equal(router.cell(0).table.weight, router.cell(1).table.weight)
     assert torch.equal(router.cell(0).encoder.weight, router.cell(1).encoder.weight)
     x = torch.rand(50, 3, generator=generator)
-    cells = router.diagram.locate(x)
-    expected = torch.stack([router.cell(int(c))(row[None])[0] for c, row in zip(cells, x)])
-    torch.testing.assert_close(router(x), expected)
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0])
 
     def replace(module: nn.Module) -> None:
         if isinstance(module, nn.Embedding):
             module.weight = nn.Parameter(torch.zeros(3, 3))
 
-    with pytest.raises(ValueError, match="apply: fn must keep names and shapes of parameters, got another 'table"):
-        router.apply(replace)
-
-
-# Optimisers and checkpoints -------------------------------------------------------------------------------------------
+    refuses("apply: fn must keep names and shapes of parameters, got another 'table", router.apply, replace)
 
 
 def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Generator) -> None:
@@ -111,9 +96,8 @@ def test_an_optimiser_that_was_made_before_wrapping_is_told(generator: torch.Gen
         warnings.simplefilter("error")
         for _ in range(64):  # no warning yet, since gradients may be accumulated
             step()
-    with pytest.warns(
-        UserWarning, match=r"no optimizer has changed the parameters.*construct it from router.parameters\(\)"
-    ) as told:
+    rule = r"no optimizer has changed the parameters.*construct it from router.parameters\(\)"
+    with pytest.warns(UserWarning, match=rule) as told:
         step()
     assert told[0].filename == __file__
     with warnings.catch_warnings():
@@ -155,8 +139,7 @@ def test_optimisers_that_train_something_are_not_told(generator: torch.Generator
         torch.optim.SGD(fields[2].parameters(), 0.1).step()
 
 
-@pytest.mark.parametrize("prefix", ["", "module."])
-@pytest.mark.parametrize("strict", [True, False])
+@pytest.mark.parametrize(("prefix", "strict"), [("", True), ("module.", False)])
 def test_a_plain_checkpoint_is_told_apart(prefix: str, strict: bool, generator: torch.Generator) -> None:
     router, plain = router_of(net(), generator), net()
     state = {prefix + name: value for name, value in plain.state_dict().items()}
@@ -172,9 +155,6 @@ def test_a_plain_checkpoint_is_told_apart(prefix: str, strict: bool, generator: 
         router.load_state_dict({"other": torch.zeros(1)})
 
 
-# Names ----------------------------------------------------------------------------------------------------------------
-
-
 class Model(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -183,6 +163,8 @@ class Model(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.layer(x)
+
+    density = forward
 
     def update_step(self, step: int) -> None:
         self.step = step
@@ -193,10 +175,9 @@ class Model(nn.Module):
 
 
 def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Generator) -> None:
-    router = router_of(Model(), generator)
-    with pytest.raises(
-        AttributeError, match=r"methods=\['update_step'\].* if it evaluates samples, else call router.mod"
-    ):
+    router = router_of(Model(), generator, methods=["density"])
+    rule = r"update_step of Model is not routed; pass methods=\['density', 'update_step'\]"
+    with pytest.raises(AttributeError, match=rf"{rule}.* if it evaluates samples, else call router.mod"):
         router.update_step(3)
     router.module.update_step(3)
     for name in ("bound", "layer", "box", "width"):
@@ -207,31 +188,22 @@ def test_attributes_and_methods_of_the_module_are_pointed_to(generator: torch.Ge
     assert not hasattr(router, "bound")
 
 
-class MadeInside(nn.Module):
-    """A module that makes a layer in every call; if ``kept``, it stores the layer as a child."""
-
-    def __init__(self, kept: bool) -> None:
-        super().__init__()
-        self.layer, self.kept = nn.Linear(3, 8), kept
-
-    def forward(self, x: Tensor) -> Tensor:
-        last = nn.Linear(8, 4)
-        if self.kept:
-            self.last = last
-        return last(self.layer(x))
+def made_inside(net: Any, x: Tensor) -> Tensor:
+    last = nn.Linear(8, 4)
+    if net.kept:
+        net.last = last
+    return last(net.layer(x))
 
 
 @pytest.mark.parametrize("kept", [True, False])
 @pytest.mark.parametrize("fuse", [True, False])
 def test_layers_that_are_made_inside_of_forward(kept: bool, fuse: bool, generator: torch.Generator) -> None:
-    router = router_of(MadeInside(kept), generator, fuse=fuse, way="fused")
-    with pytest.raises(TypeError, match="MadeInside makes layers or draws numbers inside of its forward"):
+    router = router_of(Built(made_inside, layer=(3, 8), kept=kept), generator, fuse=fuse, way="fused")
+    with pytest.raises(TypeError, match="Built makes layers or draws numbers inside of its forward"):
         router(torch.rand(100, 3, generator=generator))
 
 
 class RunningMean(nn.Linear):
-    """A layer that subtracts a running mean, which it writes into a buffer in place."""
-
     def __init__(self) -> None:
         super().__init__(3, 4)
         self.register_buffer("mean", torch.zeros(4))
@@ -243,8 +215,6 @@ class RunningMean(nn.Linear):
 
 
 class Gaussian(nn.Linear):
-    """A layer whose result is the log-likelihood of a distribution, which checks its arguments."""
-
     def forward(self, x: Tensor) -> Tensor:
         return torch.distributions.Normal(super().forward(x), 1.0, validate_args=True).log_prob(x[:, :2])
 
@@ -277,7 +247,7 @@ def test_recurrent_layers_with_dropout_and_packed_sequences(packed: bool, genera
     router, x = router_of(Forecast(packed), generator, way="fused"), torch.rand(50, 6, generator=generator)
     assert not torch.equal(router(x), router(x)), "dropout"
     router.eval()
-    expected = masked_loop(router, router.assign(x[:, :3].contiguous()), [x])[0][0]
+    expected = masked_loop(router, x)[0]
     torch.testing.assert_close(router(x), expected, rtol=1e-4, atol=1e-5)
     assert router.explain().split("\n")[-1].startswith("forward: cell by cell" if packed else "forward: grouped")
     if not packed:
@@ -285,12 +255,7 @@ def test_recurrent_layers_with_dropout_and_packed_sequences(packed: bool, genera
             router_of(Forecast(False), generator, fuse=True, way="fused")(x)
 
 
-# Parameters under other names -----------------------------------------------------------------------------------------
-
-
 class Scaled(nn.Module):
-    """A module with a layer and a parameter; tests add an attribute."""
-
     def __init__(self) -> None:
         super().__init__()
         self.layer, self.a = nn.Linear(3, 4), nn.Parameter(torch.ones(4))
@@ -312,33 +277,26 @@ KEPT: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("fuse", [True, False])
 @pytest.mark.parametrize("case", KEPT)
-def test_parameters_that_are_kept_past_their_names_are_refused(
-    case: str, fuse: bool, generator: torch.Generator
-) -> None:
+def test_parameters_that_are_kept_past_their_names_are_refused(case: str, generator: torch.Generator) -> None:
     field, (make, said) = Scaled(), KEPT[case]
     field.kept = make(field)
     with pytest.raises(TypeError, match=rf"but a Scaled keeps in `kept` .*{said}"):
-        router_of(field, generator, fuse=fuse)
+        router_of(field, generator)
     with pytest.raises(TypeError, match=r"but `1`, a Scaled, keeps in `kept` "):
-        router_of(nn.Sequential(nn.ReLU(), field), generator, fuse=fuse)
+        router_of(nn.Sequential(nn.ReLU(), field), generator)
 
 
 def test_a_buffer_that_is_a_view_of_a_parameter_is_refused(generator: torch.Generator) -> None:
     field = Scaled()
     field.register_buffer("part_of_a", field.a.detach()[:2])
-    with pytest.raises(TypeError, match="keeps in `part_of_a` a view of the parameter `a`"):
-        router_of(field, generator)
+    refuses("keeps in `part_of_a` a view of the parameter `a`", router_of, field, generator, error=TypeError)
 
 
 def test_what_a_copy_takes_along_is_not_refused(generator: torch.Generator) -> None:
     field = Scaled()
     field.method, field.copied, field.free = field.layer.forward, field.a.detach().clone(), lambda x: x + 1
     router_of(field, generator)
-
-
-# Positions ------------------------------------------------------------------------------------------------------------
 
 
 def encoding(x: Tensor, raw: bool, together: bool) -> Tensor:

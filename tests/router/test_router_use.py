@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed
+from helpers import refuses
 from ops.foreign_fields import Heads, LearnedSine, skip_net
 from ops.foreign_kinds import CodePerRay
-from router_loop import masked_loop, perturb
+from router_loop import masked_loop, perturb, tensors
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
@@ -19,11 +20,6 @@ from voronerf import NeRF, VoronoiDiagram
 from voronerf.ops._core.tolerances import FLOOR
 from voronerf.router import VoronoiRouter
 from voronerf.router.optimizers import MOMENTS, steady_part
-
-
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(11)
 
 
 def uniform(generator: torch.Generator, *shape: int) -> Tensor:
@@ -35,9 +31,6 @@ def router_of(module: nn.Module, generator: torch.Generator, k: int = 5, **optio
     return perturb(VoronoiRouter(module, uniform(generator, k, 3), **options), generator)
 
 
-# Arguments ------------------------------------------------------------------------------------------------------------
-
-
 def test_where_positions_are(generator: torch.Generator) -> None:
     x = uniform(generator, 30, 15)
     first = router_of(skip_net(), generator)
@@ -45,10 +38,10 @@ def test_where_positions_are(generator: torch.Generator) -> None:
         router = VoronoiRouter(skip_net(), first.diagram, coords=coords)
         router.load_state_dict(first.state_dict())
         cells = router.diagram.locate(x[:, shift : shift + 3])
-        torch.testing.assert_close(router(x), masked_loop(router, cells, [x])[0][0])
+        torch.testing.assert_close(router(x), masked_loop(router, x, cells=cells)[0])
     elsewhere = uniform(generator, 30, 3)
-    expected = masked_loop(first, first.diagram.locate(elsewhere), [x])[0][0]
-    torch.testing.assert_close(first(x, coords=elsewhere), expected)
+    expected = masked_loop(first, x, cells=first.diagram.locate(elsewhere))
+    torch.testing.assert_close([first(x, coords=elsewhere)], expected)
 
 
 def test_per_ray_has_to_be_said_where_shapes_do_not_tell(generator: torch.Generator) -> None:
@@ -65,25 +58,24 @@ def test_per_ray_has_to_be_said_where_shapes_do_not_tell(generator: torch.Genera
         torch.testing.assert_close(said(x, d, code=code, time=time), expected)
 
 
-def test_methods_share_an_assignment(generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
-    router = router_of(Heads(), generator, methods=["density"], assignment="stochastic", temperature=0.5)
-    drawn = []
-    sample_cell = VoronoiDiagram.sample_cell
+@pytest.mark.parametrize("fuse", [False, True])
+def test_methods_share_an_assignment(fuse: bool, generator: torch.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"methods": ["density"], "assignment": "stochastic", "temperature": 0.5}
+    router, drawn, sample_cell = router_of(Heads(), generator, fuse=fuse, **options), [], VoronoiDiagram.sample_cell
     monkeypatch.setattr(
         VoronoiDiagram, "sample_cell", lambda *args, **kwargs: drawn.append(sample_cell(*args, **kwargs)) or drawn[-1]
     )
     x, d = uniform(generator, 40, 3), uniform(generator, 40, 3)
-    _, sigma = router(x, d)
-    torch.testing.assert_close(router.density(x)["sigma"], sigma)
-    assert len(drawn) == 1
-    torch.testing.assert_close(sigma, masked_loop(router, drawn[0], [x, d])[0][1])
+    for count in (1, 2, 3):
+        _, sigma = router(x, d)
+        torch.testing.assert_close(router.density(x)["sigma"], sigma)
+        assert len(drawn) == count
+        torch.testing.assert_close(sigma, masked_loop(router, x, d, cells=drawn[-1])[1])
     router.density(x)  # a second ``density`` call with this batch draws new cells
     x.add_(1)
     router(x, d)
-    assert len(drawn) == 3
+    assert len(drawn) == 5
 
-
-# Optimisers -----------------------------------------------------------------------------------------------------------
 
 OPTIMIZERS: dict[str, Callable[[Any], torch.optim.Optimizer]] = {
     "Adam": lambda groups: torch.optim.Adam(groups, lr=1e-3, amsgrad=True),
@@ -155,11 +147,17 @@ def test_other_optimisers_begin_anew_and_say_so(generator: torch.Generator) -> N
     assert any(not torch.equal(a, b) for a, b in zip(before, router.parameters(), strict=True))
 
 
-def test_moments_that_are_soon_forgotten_stay_whole(generator: torch.Generator) -> None:
-    router = router_of(nn.Linear(3, 2), generator, k=1)
-    optimizer = torch.optim.Adam(router.parameters(), betas=(0.9, 0.99))
+def stepped(generator: torch.Generator, k: int, **options: Any) -> tuple[VoronoiRouter, torch.optim.Optimizer]:
+    """Returns a router and its Adam after a step."""
+    router = router_of(nn.Linear(3, 2), generator, k=k)
+    optimizer = torch.optim.Adam(router.parameters(), **options)
     router(uniform(generator, 90, 3)).square().sum().backward()
     optimizer.step()
+    return router, optimizer
+
+
+def test_moments_that_are_soon_forgotten_stay_whole(generator: torch.Generator) -> None:
+    router, optimizer = stepped(generator, 1, betas=(0.9, 0.99))
     before = [state["exp_avg_sq"].clone() for state in optimizer.state.values()]
     router.subdivide(3, points=uniform(generator, 90, 3), optimizer=optimizer)
     for old, state in zip(before, optimizer.state.values(), strict=True):
@@ -168,10 +166,7 @@ def test_moments_that_are_soon_forgotten_stay_whole(generator: torch.Generator) 
 
 def test_factored_squares_are_reset(generator: torch.Generator) -> None:
     """Optimisers such as Adam-mini keep one mean square for a block of a parameter."""
-    router = router_of(nn.Linear(3, 2), generator, k=2)
-    optimizer = torch.optim.Adam(router.parameters())
-    router(uniform(generator, 90, 3)).square().sum().backward()
-    optimizer.step()
+    router, optimizer = stepped(generator, 2)
     for state in optimizer.state.values():
         state["exp_avg_sq"] = state["exp_avg_sq"].flatten(1).mean(1)
     with pytest.warns(UserWarning, match="state of Adam cannot be inherited"):
@@ -188,27 +183,21 @@ def test_subdivide_by_a_number_of_children(generator: torch.Generator) -> None:
     parents = router.subdivide(2, points=x, weights=torch.rand(90, generator=generator), cells=[1])
     assert parents.tolist() == [0, 1, 1, 2, 3] and router.diagram.depth == 2
     torch.testing.assert_close(router(x), before)
-    with pytest.raises(ValueError, match="a number of children needs points, and no parents"):
-        router.subdivide(4)
+    refuses("a number of children needs points, and no parents", router.subdivide, 4)
     other = router_of(LearnedSine(), generator, k=1)
     other.subdivide(4, points=x)  # all points have equal weight
     assert other.num_cells == 4
     with pytest.raises(TypeError, match="must be a VoronoiDiagram or a number of children, got float"):
         router.subdivide(2.0)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="points must come with a number of children"):
-        router.subdivide(router.diagram, points=x)
+    refuses("points must come with a number of children", router.subdivide, router.diagram, points=x)
     stranger = torch.optim.SGD([nn.Parameter(torch.zeros(1))])
-    with pytest.raises(ValueError, match="optimizer must hold the router's parameters"):
-        router.subdivide(router.diagram, optimizer=stranger)
+    refuses("optimizer must hold the router's parameters", router.subdivide, router.diagram, optimizer=stranger)
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.5, 1.0])
 def test_children_share_the_moments_of_their_parent(generator: torch.Generator, mean: float) -> None:
     """A third of the samples has a third of the mean gradient and of the variance, and a ninth of the mean's square."""
-    router = router_of(nn.Linear(3, 2), generator, k=2)
-    optimizer = torch.optim.Adam(router.parameters())
-    router(uniform(generator, 90, 3)).square().sum().backward()
-    optimizer.step()
+    router, optimizer = stepped(generator, 2)
     for state in optimizer.state.values():
         state["exp_avg"] *= mean  # relative to the root mean square
     before = [{key: value.clone() for key, value in state.items()} for state in optimizer.state.values()]
@@ -220,33 +209,7 @@ def test_children_share_the_moments_of_their_parent(generator: torch.Generator, 
         assert state["step"] == old["step"]
 
 
-def test_adam_learns_at_once_after_a_split() -> None:
-    """Moments that are not divided make up to 16 times shorter steps for a thousand steps."""
-    errors = {}
-    for inherits in (True, False):
-        torch.manual_seed(0)
-        net = nn.Sequential(nn.Linear(2, 32), nn.ReLU(), nn.Linear(32, 1))
-        router = VoronoiRouter(net, torch.zeros(1, 2), coords="first2", fuse=True)
-        optimizer, x = torch.optim.Adam(router.parameters(), lr=0.005), torch.rand(2000, 2) * 2 - 1
-        for step in range(400):
-            if step == 200:
-                router.subdivide(16, points=x, optimizer=optimizer)
-                for state in () if inherits else optimizer.state.values():
-                    state["exp_avg"] *= 16
-                    state["exp_avg_sq"] *= 16
-            error = (router(x) - torch.sin(8 * x.norm(dim=-1, keepdim=True))).square().mean()
-            optimizer.zero_grad()
-            error.backward()
-            optimizer.step()
-        errors[inherits] = error.item()
-    assert errors[True] < 0.8 * errors[False], errors
-
-
-# Modes and wrappers ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-@pytest.mark.parametrize("make", [skip_net, LearnedSine])
+@pytest.mark.parametrize(("make", "dtype"), [(skip_net, torch.bfloat16), (LearnedSine, torch.float16)])
 def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: type[nn.Module]) -> None:
     router = router_of(make(), generator)
     x = uniform(generator, 64, 15 if make is skip_net else 3).to(dtype)
@@ -257,19 +220,6 @@ def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: ty
         actual = router(x)
         assert actual.dtype == dtype
         torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
-
-
-@pytest.mark.parametrize("make", [skip_net, LearnedSine])
-def test_autocast(generator: torch.Generator, make: type[nn.Module]) -> None:
-    router = router_of(make(), generator)
-    x = uniform(generator, 64, 15 if make is skip_net else 3)
-    exact = router(x)
-    for _ in range(3):
-        with torch.autocast("cpu", torch.bfloat16):
-            actual = router(x)
-            assert actual.dtype == router.cell(0)(x).dtype
-        torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
-        assert router(x).dtype == torch.float32
 
 
 class Fast(nn.Module):
@@ -296,23 +246,15 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
     perturb(router, generator, 0.01 if make is Fast else 0.2)
     x = uniform(generator, 120, 15 if make is skip_net else 3)
     router(x)  # the first call runs without autocast
-    cells = router.diagram.locate(x[:, :3])
     exact_router = copy.deepcopy(router).double()
-    (exact, *_), exact_modules = masked_loop(exact_router, cells, [x.double()])
+    exact = masked_loop(exact_router, x.double())[0]
     with torch.autocast("cpu", dtype):
-        actual = router(x)
-        actual = actual[0] if isinstance(actual, tuple) else actual
-        (loop, *_), modules = masked_loop(router, cells, [x])
+        actual, loop = (tensors(result)[0] for result in (router(x), masked_loop(router, x)))
     assert router.explain() == "forward: fused" and actual.dtype == loop.dtype
-    weights = torch.randn(exact.shape, generator=generator)
-    for y in (actual, loop, exact):
-        (y * weights.to(y)).sum().backward()
-    pairs = [(actual, loop, exact)]
-    for name, p in router.module.named_parameters():
-        if p.grad is not None:
-            own = [torch.stack([m.get_parameter(name).grad for m in cells]) for cells in (modules, exact_modules)]
-            pairs.append((p.grad, *own))
-    for ours, theirs, right in pairs:
+    weights, slopes = torch.randn(exact.shape, generator=generator), []
+    for y, r in ((actual, router), (loop, router), (exact, exact_router)):
+        slopes.append(torch.autograd.grad((y * weights.to(y)).sum(), [*r.parameters()], materialize_grads=True))
+    for ours, theirs, right in ((actual, loop, exact), *zip(*slopes, strict=True)):
         error, other = ((y.double() - right).norm() for y in (ours, theirs))
         assert error <= 2 * other + FLOOR[dtype] * right.norm()
 
@@ -349,6 +291,12 @@ class Labelled(Tensor):
 
     def column(self, name: str) -> Tensor:
         return self.as_subclass(Tensor)[..., self._labels.index(name)]
+
+
+class Unsliced(Tensor):
+    """A tensor subclass whose slices lack the column names."""
+
+    column = Labelled.column
 
 
 class Named(nn.Module):
@@ -397,39 +345,21 @@ def test_a_layer_table_takes_subclasses_of_tensors(generator: torch.Generator) -
 @pytest.mark.parametrize("options", WAYS)
 def test_modules_that_need_a_subclass_of_tensors_are_told(generator: torch.Generator, options: dict[str, Any]) -> None:
     x = uniform(generator, 60, 3)
-    labelled = Labelled.of(x, list("xyz"))
-    router = router_of(Named("always"), generator, **options)
-    with pytest.raises(
-        TypeError, match=r"Named.forward must work with plain .*needs a Labelled \(AttributeError: .*; extract"
-    ):
-        router(labelled)
+    labelled, unsliced = Labelled.of(x, list("xyz")), x.as_subclass(Unsliced)
+    unsliced._labels = list("xyz")
+    for argument, name in ((labelled, "Labelled"), (unsliced, "Unsliced")):
+        rule = rf"Named.forward must work with plain .*needs a {name} \(AttributeError: .*; extract"
+        with pytest.raises(TypeError, match=rule):
+            router_of(Named("always"), generator, **options)(argument)
     router = router_of(Named("where there are some"), generator, **options)
     router(x)
+    rule = r"Named.forward must work with .* needs a Labelled \(its results differ\); extract"
     for _ in range(2):
-        with pytest.raises(
-            TypeError, match=r"Named.forward must work with .* needs a Labelled \(its results differ\); extract"
-        ):
+        with pytest.raises(TypeError, match=rule):
             router(labelled)
-    with pytest.raises(
-        TypeError, match="results must be plain tensors, got a Labelled; make it of the router's results"
-    ):
+    rule = "results must be plain tensors, got a Labelled; make it of the router's results"
+    with pytest.raises(TypeError, match=rule):
         router_of(Named("for results"), generator, **options)(x)
-
-
-class Unsliced(Tensor):
-    """A tensor subclass whose slices lack the column names."""
-
-    def column(self, name: str) -> Tensor:
-        return self.as_subclass(Tensor)[..., self._labels.index(name)]
-
-
-@pytest.mark.filterwarnings("ignore:.*cell by cell")
-@pytest.mark.parametrize("options", WAYS)
-def test_a_subclass_of_tensors_whose_pieces_do_not_work(generator: torch.Generator, options: dict[str, Any]) -> None:
-    x = uniform(generator, 60, 3).as_subclass(Unsliced)
-    x._labels = list("xyz")
-    with pytest.raises(TypeError, match=r"Named.forward must work with plain .*needs a Unsliced \(AttributeError: "):
-        router_of(Named("always"), generator, **options)(x)
 
 
 class Bent(nn.Module):
@@ -445,33 +375,9 @@ def test_compiled_parts_have_no_parameters(generator: torch.Generator) -> None:
             VoronoiRouter(module, torch.rand(4, 3), coords="first3")
     module = nn.Sequential(nn.Linear(3, 4), torch.jit.script(Bent()), nn.Linear(4, 2))
     router, x = router_of(module, generator), uniform(generator, 60, 3)
-    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0])
     router = router_of(module, generator, fuse=True)
-    with pytest.raises(ValueError, match=r"perhaps part '1', which torch\.jit has compiled; use"):
-        router(x)
-
-
-def test_compile_checkpoint_and_functional_call(generator: torch.Generator) -> None:
-    router = router_of(skip_net(), generator)
-    x = uniform(generator, 40, 15)
-    expected, parameters = router(x), list(router.parameters())
-    wanted = torch.autograd.grad(expected.square().sum(), parameters)
-    halves = {name: p.detach() / 2 for name, p in router.named_parameters()}
-    calls: list[Callable[[], Tensor]] = [
-        lambda: torch.compile(router, backend="eager")(x),
-        lambda: checkpoint(router, x, use_reentrant=False),
-        lambda: torch.func.functional_call(router, dict(router.named_parameters()), (x,)),
-    ]
-    for call in calls:
-        actual = call()
-        torch.testing.assert_close(actual, expected)
-        for a, b in zip(torch.autograd.grad(actual.square().sum(), parameters), wanted, strict=True):
-            torch.testing.assert_close(a, b)
-    assert not torch.allclose(torch.func.functional_call(router, halves, (x,)), expected)
-    torch._dynamo.reset()
-    with pytest.raises(Exception, match="a routed module runs eagerly between two graphs"):
-        torch.compile(router, backend="eager", fullgraph=True)(x)
-    torch.testing.assert_close(router(x), expected)
+    refuses("perhaps part '1', which torch.jit has compiled; use", router, x)
 
 
 class Checkpointed(nn.Module):
@@ -484,11 +390,10 @@ class Checkpointed(nn.Module):
 
 
 def test_reentrant_checkpoints_inside(generator: torch.Generator) -> None:
-    router = router_of(Checkpointed(), generator)
-    x = uniform(generator, 30, 3).requires_grad_()
-    (expected,), modules = masked_loop(router, router.diagram.locate(x), [x])
+    router, x = router_of(Checkpointed(), generator), uniform(generator, 30, 3).requires_grad_()
+    modules = [router.cell(i) for i in range(router.num_cells)]
     router(x).square().sum().backward()
-    expected.square().sum().backward()
+    masked_loop(router, x, modules=modules)[0].square().sum().backward()
     for name, parameter in router.module.named_parameters():
         theirs = [m.get_parameter(name) for m in modules]
         grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in theirs]
@@ -509,8 +414,7 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
         for parameter, gradient in zip(router.parameters(), wanted, strict=True):
             torch.testing.assert_close(parameter.grad, gradient)
         router.subdivide(2, points=x[:, :3])
-        with pytest.raises(RuntimeError, match="wraps the parameters from before subdivide; wrap the router again"):
-            wrapped(x)
+        refuses("wraps the parameters from before subdivide; wrap the router again", wrapped, x, error=RuntimeError)
         nn.parallel.DistributedDataParallel(router)(x).sum().backward()
     finally:
         torch.distributed.destroy_process_group()
@@ -526,9 +430,6 @@ def test_an_average_of_weights_is_split_with_its_router(generator: torch.Generat
     average.module.subdivide(router.diagram, parents)
     average.update_parameters(router)
     torch.testing.assert_close(average(x), router(x))
-
-
-# Decisions ------------------------------------------------------------------------------------------------------------
 
 
 class Decides(nn.Module):
@@ -551,11 +452,11 @@ def test_decisions_are_those_of_each_cell_or_refused(generator: torch.Generator,
     router = router_of(Decides(inverted), generator)
     x = uniform(generator, 60, 3)
     x[:, 0] = -x[:, 0].abs()
-    torch.testing.assert_close(router(x), masked_loop(router, router.diagram.locate(x), [x])[0][0])
+    torch.testing.assert_close(router(x), masked_loop(router, x)[0])
     x[7, 0] = 0.5
     try:
         result = router(x)
     except TypeError as error:
         assert "mixes samples" in str(error)
     else:
-        torch.testing.assert_close(result, masked_loop(router, router.diagram.locate(x), [x])[0][0])
+        torch.testing.assert_close(result, masked_loop(router, x)[0])
