@@ -16,7 +16,6 @@ from voronerf.app.evaluate import lpips as module
 from voronerf.app.evaluate.lpips import SHAPES, Lpips, LpipsError, find_lpips, read_weights
 
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
-Weights = dict[str, torch.Tensor]
 
 
 @pytest.fixture(autouse=True)

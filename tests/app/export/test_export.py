@@ -1,5 +1,6 @@
 """Tests of exported points, meshes and cells, which are loaded again; the runs' fields are formulas."""
 
+import functools
 import itertools
 import json
 import re
@@ -16,6 +17,7 @@ from helpers import refuses, renderer_of, seeded
 
 from voronerf import VoronoiDiagram
 from voronerf.app.evaluate.panels import palette
+from voronerf.app.evaluate.scores import in_silence
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
 from voronerf.app.export.mesh import REACH, _fused
 from voronerf.app.export.space import SurfaceView, views_of, write_geometry
@@ -84,17 +86,6 @@ def linear(colour):
     return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
 
 
-def loaded(path):
-    """Returns (mesh, vertex colours): the mesh as trimesh reads it, with z up, and its vertex colours in sRGB."""
-    mesh = trimesh.load(path, force="mesh", process=False)
-    if path.suffix != ".glb":
-        return mesh, mesh.visual.vertex_colors[:, :3]
-    ((arrays, _),) = read_glb(path).values()
-    mesh.apply_transform([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # to z up, as Blender does
-    bytes_of_linear = np.searchsorted(linear(np.arange(256) / 255) * 65535, arrays["COLOR_0"][:, :3] - 0.5)
-    return mesh, bytes_of_linear
-
-
 @pytest.fixture(scope="module")
 def run():
     scene = replace(builtin_scene(24, train_views=20, test_views=1), box=BOX)
@@ -103,11 +94,29 @@ def run():
     return Run(Path("unused"), SimpleNamespace(), scene, router, renderer_of({"field": shell}, samples=192))
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
+@pytest.fixture(scope="module", autouse=True)
+def rendered_once():
+    """Renders the views of a run only once, unless their progress is shown."""
+    rendered = {}
+
+    def views_once(shown, cameras, track=in_silence):
+        key = id(shown), len(cameras), cameras.width
+        if key not in rendered or track is not in_silence:
+            rendered[key] = views_of(shown, cameras, track), shown
+        return rendered[key][0]
+
+    with pytest.MonkeyPatch.context() as patched:
+        for module in ("mesh", "points"):
+            patched.setattr(f"voronerf.app.export.{module}.views_of", views_once)
+        yield
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
 def test_a_mesh_is_the_outer_surface_alone(run, tmp_path, suffix):
     path = tmp_path / "deep" / f"ball{suffix}"
     export_mesh(run, path, resolution=48)
-    mesh, colours = loaded(path)
+    mesh = trimesh.load(path, force="mesh", process=False)
+    colours = mesh.visual.vertex_colors[:, :3]
     assert mesh.is_watertight and mesh.body_count == 1  # no inner surface, and no speck
     distance = np.abs(np.linalg.norm(mesh.vertices, axis=-1) - RADIUS)
     assert distance.mean() < 0.02 and distance.max() < 0.06
@@ -150,12 +159,11 @@ def test_a_glb_stands_upright_and_has_linear_colours(run, tmp_path, to_files):
     returned, _ = (
         export_mesh(turned, tmp_path / f"ball.{kind}", resolution=32, to_files=to_files) for kind in ("glb", "ply")
     )
-    ply = trimesh.load(tmp_path / "ball.ply", process=False)
+    ply, glb = (trimesh.load(tmp_path / f"ball.{kind}", force="mesh", process=False) for kind in ("ply", "glb"))
+    assert np.array_equal(ply.faces, glb.faces)
     ((arrays, material),) = read_glb(tmp_path / "ball.glb").values()
-    assert material == {
-        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
-        "doubleSided": True,
-    }
+    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    assert material == {"pbrMetallicRoughness": rough, "doubleSided": True}
     x, y, z = np.asarray(ply.vertices, dtype=np.float32).T
     assert np.array_equal(arrays["POSITION"], np.stack((x, z, -y), 1))
     assert np.abs(returned.vertices - ply.vertices).max() < 1e-6  # both have z up
@@ -320,7 +328,8 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
     empty = torch.tensor([[5.0, 5, 5], [6.0, 6, 6]])
     fog = lambda positions, *rest: (torch.ones_like(positions), torch.full_like(positions[:, 0], 0.01))  # noqa: E731
     faint = replace(run, renderer=renderer_of({"field": fog}, samples=16))
-    for export, shown, box in itertools.product((export_points, export_mesh), (run, faint), (empty, BOX, None)):
+    coarse = functools.partial(export_mesh, resolution=16)
+    for export, shown, box in itertools.product((export_points, coarse), (run, faint), (empty, BOX, None)):
         if shown is faint or box is empty:
             rule = "unused: the training views show no surface in the box"
             refuses(rule, export, shown, path, box=box, error=ConfigError)
@@ -329,17 +338,6 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
             patch.setitem(sys.modules, module, None)
             refuses(f"needs {package}: pip install 'voronerf[export]'", export_mesh, run, path, error=ImportError)
     assert not list(tmp_path.iterdir())
-
-
-def test_meshes_in_the_coordinates_of_the_files(run, tmp_path):
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=seeded(), dtype=torch.float64))[0]
-    turn *= torch.linalg.det(turn)
-    transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, :3], transform[:3, 3] = 0.25 * turn, torch.tensor([0.1, 0.2, 0.3])  # a unit of the scene is 4 metres
-    moved = replace(run, scene=replace(run.scene, transform=transform))
-    assert export_mesh(run, tmp_path / "scene.ply", resolution=32).extents.max() < 1.3
-    extents = export_mesh(moved, tmp_path / "metres.ply", resolution=32, to_files=True).extents
-    assert extents.min() > 4.2 and extents.max() < 5.4
 
 
 def test_a_floor_within_a_layer_of_blocks_has_no_hole():

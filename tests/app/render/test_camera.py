@@ -14,9 +14,10 @@ from voronerf.nerf import Cameras, Renderer, Stratified, orbit_cameras
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 12), (33, 5)])
-def test_what_is_opaque_stays_as_it_is(size):
+def test_what_is_opaque_stays_as_it_is_and_a_picture_of_nothing_is_black(size):
     colour = torch.rand(*size, 3)
     assert torch.equal(fill_holes(colour, torch.ones(size)), colour)
+    assert not fill_holes(torch.zeros(*size, 3), torch.zeros(size)).any()
 
 
 def test_a_hole_has_the_colour_of_what_lies_beside_it():
@@ -37,10 +38,6 @@ def test_a_gradient_goes_on_through_a_hole():
     assert float((filled - colour).abs().max()) < 0.1
 
 
-def test_a_picture_of_nothing_is_black():
-    assert not fill_holes(torch.zeros(4, 6, 3), torch.zeros(4, 6)).any()
-
-
 def test_photographs_alone_are_filled():
     """Holes are filled if the scene has no background colour and no box, except in the viewer (fill=False)."""
 
@@ -54,11 +51,8 @@ def test_photographs_alone_are_filled():
     filled = render_camera(renderer, scene, cameras, 0).colour
     torch.testing.assert_close(filled, torch.full_like(filled, 0.75))
     boxed = replace(scene, box=torch.tensor([[-2.0, -2, -2], [2, 2, 2]]))
-    for other, options, hole in (
-        (replace(scene, background="white"), {}, 1),
-        (boxed, {}, 0),
-        (scene, {"fill": False}, 0),
-    ):
+    white = replace(scene, background="white")
+    for other, options, hole in ((white, {}, 1), (boxed, {}, 0), (scene, {"fill": False}, 0)):
         seen = render_camera(renderer, other, cameras, 0, **options).colour[12, 12]
         assert seen.tolist() == [hole] * 3
 

@@ -3,8 +3,8 @@
 import json
 import os
 import struct
+import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,6 @@ from PIL import Image
 from voronerf.app.scenes.lenses import MODELS
 from voronerf.nerf.cameras import orbit_cameras
 
-Contents = dict[str, Any]
 DATA = Path(os.environ.get("VORONERF_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 
 #: The number of cameras around an object, the image size (width, height), and points that all cameras see.
@@ -50,6 +49,12 @@ def write_capture(folder, cameras, **entries):
         Image.fromarray(grey).save(folder / f"{index:02d}.png")
         frames.append({"file_path": f"{index:02d}.png", "transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 20.0, **entries, "frames": frames[::-1]}))
+
+
+def write_frames(folder, poses, name="images/{:02d}.jpg".format, **entries):
+    """Writes a transforms.json with a frame for each pose; ``name`` maps the number of a pose to the image's name."""
+    frames = [{"file_path": name(index), "transform_matrix": pose.tolist()} for index, pose in enumerate(poses)]
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 20, **entries, "frames": frames}))
 
 
 def write_walls(folder, views):
@@ -98,6 +103,24 @@ def write_images(folder, sizes, **save):
     (folder / "images").mkdir(parents=True, exist_ok=True)
     for index, (width, height) in enumerate(sizes):
         Image.fromarray(np.full((height, width, 3), index, np.uint8)).save(folder / f"images/{index:02d}.jpg", **save)
+
+
+def write_deep(path, values):
+    """Writes 16-bit values [h, w, channels] as PNG, or colours as TIFF."""
+    height, width, channels = values.shape
+    if path.suffix == ".png":
+        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
+        header = struct.pack(">2I5B", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
+        parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+        chunks = [struct.pack(">I", len(part)) + kind + part for kind, part in parts]
+        checked = [chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks]
+        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(checked))
+    else:
+        tags = {256: width, 257: height, 258: 122, 259: 1, 262: 2, 273: 128, 277: 3, 278: height, 279: values.size * 2}
+        counts = [(tag, 3, 3 if tag == 258 else 1, value) for tag, value in tags.items()]
+        entries = b"".join(struct.pack("<2H2I", *each) for each in counts)
+        start = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 4
+        path.write_bytes(start.ljust(122, b"\0") + struct.pack("<3H", 16, 16, 16) + values.astype("<u2").tobytes())
 
 
 def quaternion(turn):
@@ -164,6 +187,13 @@ def write_llff(folder, poses, size, focal, bounds):
     np.save(folder / "poses_bounds.npy", rows)
 
 
+def oriented(tag):
+    """Returns Exif data with an orientation tag."""
+    exif = Image.Exif()
+    exif[0x0112] = tag
+    return exif
+
+
 def write_both(folder, sizes=(SIZE,) * COUNT, *, binary=True, **save):
     write_images(folder, sizes, **save)
     write_colmap(folder, POSES, sizes, POINTS, binary=binary)
@@ -174,3 +204,12 @@ def every(scene):
     """Returns (names, poses) of all views, sorted by name."""
     rows = [*zip(scene.train.names, scene.train.cameras.poses), *zip(scene.test.names, scene.test.cameras.poses)]
     return [name for name, _ in sorted(rows)], torch.stack([pose for _, pose in sorted(rows)])
+
+
+def check_pairs(scene, count=COUNT):
+    """Checks that a scene, not normalised, has ``count`` images, and that an image of grey value i has pose i."""
+    assert len(scene.train) + len(scene.test) == count
+    for split in (scene.train, scene.test):
+        for image, pose in zip(split.images, split.cameras.poses):
+            torch.testing.assert_close(pose, POSES[int(image[0, 0, 0])], atol=1e-5, rtol=0)
+    return scene

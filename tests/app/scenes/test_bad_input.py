@@ -2,20 +2,19 @@
 
 import json
 import math
-import struct
 import sys
-import zlib
 
 import numpy as np
 import pytest
 from helpers import refuses
 from PIL import Image
-from scene_files import rewrite
+from scene_files import rewrite, write_deep
 
 from voronerf.app import files
 from voronerf.app.scenes import SceneError, load_scene
 from voronerf.app.scenes.images import read_image
 
+NO_LIMIT = not hasattr(sys, "get_int_max_str_digits")  # of the digits of an integer
 POSE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 4], [0, 0, 0, 1]]
 NOISE = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8)
 
@@ -27,21 +26,6 @@ def write_noise(folder, count=3, **entries):
         Image.fromarray(NOISE).save(folder / f"{index}.png")
     frames = [{"file_path": f"{index}.png", "transform_matrix": POSE} for index in range(count)]
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 9.0, **entries, "frames": frames}))
-
-
-def deep_png(width, height, colour):
-    """Returns the bytes of a PNG with 16 bits a channel; colour 0 is grey, 2 RGB, 4 grey with alpha, 6 RGBA."""
-    rows = bytes(1 + width * 2 * {0: 1, 2: 3, 4: 2, 6: 4}[colour]) * height
-    chunks = {
-        b"IHDR": struct.pack(">IIBBBBB", width, height, 16, colour, 0, 0, 0),
-        b"IDAT": zlib.compress(rows),
-        b"IEND": b"",
-    }
-    parts = [
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        for name, data in chunks.items()
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def fails(folder, *parts, downscale=1):
@@ -80,12 +64,10 @@ def test_downscale(tmp_path):
         ('{"frames": [1]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": 3}]}', "frame 0 has no file_path"),
         ('{"frames": [{"file_path": "a\\u0000"}]}', "frame 0 has no file_path"),
-        (
-            '{"frames": [{"file_path": "\\ud800.png"}]}',
-            r"frame 0: file_path must be text without surrogates, got '\ud800",
-        ),
+        ('{"frames": [{"file_path": "\\ud800.png"}]}', r"file_path must be text without surrogates, got '\ud800"),
         ('{"frames": [{"file_path": "x.png"}]}', "frame 0 (x.png): transform_matrix"),
         ("[" * 100_000, "is not JSON: it is nested too deeply"),
+        pytest.param("9" * 5000, "is not JSON", id="digits", marks=pytest.mark.skipif(NO_LIMIT, reason="no limit")),
     ],
 )
 def test_json(tmp_path, text, reason):
@@ -141,7 +123,6 @@ def test_pose(tmp_path, matrix, reason):
     ],
 )
 def test_a_frame_without_a_pose_is_left_out_but_not_all_frames(tmp_path, matrix, reason):
-    """A few frames without a pose are left out with a note; if no frame has a pose, the first one is refused."""
     write_noise(tmp_path, count=4)
 
     def change(contents, count):
@@ -177,11 +158,13 @@ def test_images(tmp_path):
     ):
         path.write_bytes(broken)
         fails(tmp_path, f"2.png: {reason}")
-    path.write_bytes(deep_png(8, 6, 0))
+    deep = np.random.default_rng(0).integers(0, 2**16, (6, 8, 4))
+    write_deep(path, deep[..., :1])
     fails(tmp_path, "2.png: has grey values of more than 8 bits; write it with 8 bits a channel")
-    for colour in (2, 4, 6):  # RGB, grey with alpha, RGBA
-        path.write_bytes(deep_png(8, 6, colour))
-        assert not read_image(path, 1)[..., :3].any()
+    for channels in (2, 4, 3):  # grey with alpha, RGBA, RGB
+        write_deep(path, deep[..., :channels])
+        assert np.array_equal(read_image(path, 1)[..., [0, -1]], deep[..., [0, channels - 1]] >> 8)
+    assert "1 images have 16 bits a channel, of which the upper 8 are read: 2.png" in load_scene(tmp_path).notes
     for kind in ("EPS", "GIF", "TIFF", "PPM"):  # for EPS, Pillow starts Ghostscript
         with open(path, "wb") as file:
             Image.fromarray(NOISE).save(file, kind)
@@ -217,7 +200,6 @@ def test_images(tmp_path):
         ({"latlong": True}, "an EQUIRECTANGULAR image must be 2 to 1, got 8 x 6 pixels"),
         *[({key: True}, f"{key} is not supported, only") for key in ("orthographic", "from_mitsuba")],
         ({"ftheta_p0": 0.0, "ftheta_p1": 0.1}, "ftheta_p1 is not supported, only lenses that are PINHOLE"),
-        ({"camera_model": "ORTHOPHOTO"}, "camera model ORTHOPHOTO is not supported, only PINHOLE"),
         ({"fisheye_crop_radius": "9"}, "fisheye_crop_radius must be a finite number up to 1e+09, got '9'"),
         ({"fisheye_crop_radius": 0.2}, "png: its mask and its lens exclude all pixels"),
         ({"applied_scale": 0}, "applied_scale must be positive, got 0"),
@@ -229,10 +211,7 @@ def test_images(tmp_path):
         ({"fl_x": 1e7}, "fl_x must give a focal length of 0.001 to 1000 times the 8 pixels of the image, got 1e+07"),
         ({"fl_x": None, "camera_angle_x": 1e-300}, "camera_angle_x must be positive, got 1e-300"),
         ({"fl_x": None, "camera_angle_x": 1e-5}, "camera_angle_x must give a focal length of 0.001 to 1000 times"),
-        (
-            {"distortion_params": [0.1, 0, 0, 0]},
-            "distortion_params must be six numbers, k1, k2, k3, k4, p1, p2, got [0.1",
-        ),
+        ({"distortion_params": [0.1, 0, 0, 0]}, "_params must be six numbers, k1, k2, k3, k4, p1, p2, got [0.1"),
         ({"distortion_params": [0, 0, 0, 0.1, 0, 0]}, "lens distortion k4 is not supported"),
         ({"distortion_params": ["0"] * 6}, "k4 must be a finite number up to 1e+09, got '0'"),
         ({"test_filenames": "0.png"}, "test_filenames must be a list of file names, got '0.png'"),
@@ -240,20 +219,11 @@ def test_images(tmp_path):
         ({"train_filenames": ["0.png"], "test_filenames": ["./0.png"]}, "must differ, both have 0.png"),
         ({"train_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for testing"),
         ({"test_filenames": ["0.png", "1.png", "2.png"]}, "leave no image for training"),
-        ({"cy": 1e39}, "cy must be a finite number up to 1e+09, got 1e+39"),
     ],
 )
 def test_intrinsics_and_lens(tmp_path, entries, reason):
     write_noise(tmp_path, **entries)
     fails(tmp_path, reason)
-
-
-@pytest.mark.skipif(not hasattr(sys, "get_int_max_str_digits"), reason="this Python reads integers of any length")
-def test_more_digits_than_python_reads(tmp_path):
-    write_noise(tmp_path, k1=0)
-    path = tmp_path / "transforms.json"
-    path.write_text(path.read_text().replace('"k1": 0', '"k1": 1' + "0" * sys.get_int_max_str_digits()))
-    fails(tmp_path, "transforms.json: is not JSON")
 
 
 def test_blender(tmp_path):

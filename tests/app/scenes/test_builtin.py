@@ -9,7 +9,7 @@ from helpers import refuses
 
 from voronerf.app.scenes import builtin_scene, load_scene
 from voronerf.app.scenes.builtin.caster import Caster
-from voronerf.app.scenes.builtin.pictures import LIGHT, bounds, shaded
+from voronerf.app.scenes.builtin.pictures import LIGHT, shaded
 from voronerf.app.scenes.builtin.plain import SOLIDS
 from voronerf.app.scenes.builtin.solids import Box, Cylinder, Sphere, Torus, rotation
 from voronerf.app.scenes.carving import MARGIN, _Silhouette, carve_box
@@ -89,19 +89,7 @@ def test_hits_against_marching(solid):
     assert (points >= box[0] - 1e-3).all() and (points <= box[1] + 1e-3).all()
 
 
-def test_every_solid_is_seen_and_in_the_box():
-    box = bounds(SOLIDS)
-    for solid in SOLIDS:
-        own = solid.bounds()
-        assert (own[0] >= box[0]).all() and (own[1] <= box[1]).all()
-        above = np.array([solid.centre], dtype=np.float32) + np.array([[0.9, -0.8, 2.5]], dtype=np.float32)
-        aim = solid.bounds().mean(axis=0, keepdims=True) - above
-        _, depth = cast(above, aim / np.linalg.norm(aim))
-        assert np.isfinite(depth).all()
-
-
 def test_pixels_are_the_average_of_their_rays(scene):
-    """A pixel is the mean of 3 x 3 camera rays."""
     cameras = scene.test.cameras
     offsets = (torch.arange(3) + 0.5) / 3
     for y, x in ((12, 20), (25, 14), (30, 25), (1, 1)):
@@ -116,7 +104,7 @@ def test_pixels_are_the_average_of_their_rays(scene):
 def test_shape_and_determinism(scene):
     assert scene.train.images.shape == (100, 40, 40, 4) and scene.test.images.shape == (25, 40, 40, 4)
     assert (scene.near, scene.far, scene.background) == (2, 6, "white")
-    first, again = (builtin_scene(6, test_views=views).train.images for views in (1, 2))
+    first, again = (builtin_scene(6, train_views=9, test_views=views).train.images for views in (1, 2))
     assert torch.equal(first, again)
     alpha = scene.train.images[..., 3]
     assert 0.3 < float((alpha > 0).float().mean()) < 0.6
@@ -149,10 +137,9 @@ def test_sizes():
 
 
 def test_carved_box_holds_the_scene_and_is_tight(scene):
-    """The carved box holds the scene even with one empty mask."""
     masks = scene.train.images[..., 3]
     wrong = masks.clone()
-    wrong[50] = 0
+    wrong[50] = 0  # an empty mask
     for alpha in (wrong, masks):
         box = carve_box(scene.train.cameras, alpha, 2.0, 6.0)
         assert box is not None and scene.box is not None
@@ -165,11 +152,10 @@ def test_carved_box_holds_the_scene_and_is_tight(scene):
 
 @pytest.mark.parametrize("k1", [-1.0, 0.8])
 def test_box_is_carved_by_masks_of_a_lens(scene, k1):
-    straight = scene.train.cameras
+    straight, masks = scene.train.cameras[:50], scene.train.images[:50, ..., 3]
     lenses = torch.zeros(len(straight), 8)
     lenses[:, 0] = k1
     cameras = replace(straight, distortion=lenses)
-    masks = scene.train.images[..., 3]
     bent = torch.zeros_like(masks)
     for index in range(len(cameras)):  # looks up each ray in the mask without a lens
         rays = cameras.image_rays(index)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers import python, refuses
 from PIL import Image
+from scene_files import oriented
 
 from voronerf.app.scenes import SceneError, images
 from voronerf.app.scenes.images import area_average, read_header, read_image, read_images
@@ -34,19 +35,15 @@ def test_area_average_does_not_bleed_hidden_colours():
     image = np.zeros((2, 2, 4), dtype=np.uint8)
     image[0, 0] = (200, 100, 50, 255)
     image[1, 1] = (0, 255, 0, 0)  # transparent green
-    assert area_average(image, 2)[0, 0].tolist() == [200, 100, 50, 64]
-
-
-def test_opaque_average_and_identity():
-    image = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert area_average(image, 1) is image
-    assert np.array_equal(area_average(image, 4)[0, 0], np.rint(image.reshape(16, 3).mean(axis=0)))
+    assert area_average(image, 2)[0, 0].tolist() == [200, 100, 50, 64]
+    opaque = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    assert np.array_equal(area_average(opaque, 4)[0, 0], np.rint(opaque.reshape(16, 3).mean(axis=0)))
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 6, 8, 12, 16])
-@pytest.mark.parametrize("size", [(48, 64), (53, 67)])
-def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
-    height, width = size
+def test_jpeg_reduction_is_the_area_average(tmp_path, factor):
+    height, width = (48, 67) if factor == 8 else (53, 67)
     y, x = np.mgrid[:height, :width]
     smooth = np.stack((127 + 100 * np.sin(x / 9), 127 + 100 * np.cos(y / 7), x + y), axis=-1).astype(np.uint8)
     path = tmp_path / "a.jpg"
@@ -57,13 +54,11 @@ def test_jpeg_reduction_is_the_area_average(tmp_path, factor, size):
     assert np.abs(reduced.astype(int) - expected.astype(int)).mean() < 2
 
 
-@pytest.mark.parametrize("tag", [1, 3, 6, 8])
-@pytest.mark.parametrize("mode", ["RGB", "L"])
-def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, tag, mode):
+@pytest.mark.parametrize(("mode", "tag"), [("RGB", 1), ("RGB", 3), ("RGB", 6), ("RGB", 8), ("L", 6)])
+def test_a_jpeg_with_a_second_picture_is_read_like_one_without(tmp_path, mode, tag):
     """A preview or gain map in the JPEG (an MPF index, as phones and Sony cameras write) is ignored."""
     pixels = np.random.default_rng(tag).integers(0, 256, (48, 64, 3), np.uint8)
-    picture, exif = Image.fromarray(pixels).convert(mode), Image.Exif()
-    exif[0x0112] = tag
+    picture, exif = Image.fromarray(pixels).convert(mode), oriented(tag)
     one, two = tmp_path / "one.jpg", tmp_path / "two.jpg"
     picture.save(one, quality=90, exif=exif)
     picture.save(two, "MPO", save_all=True, append_images=[picture.resize((16, 12))], quality=90, exif=exif)
@@ -127,10 +122,8 @@ def test_what_does_not_fit_into_memory_is_not_decoded(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "available_memory", lambda: needed / 0.75)
     assert read_images(paths, 1)[0].shape == (4, 50, 100, 3)
     monkeypatch.setattr(images, "available_memory", lambda: (needed - 1) / 0.75)
-    message = (
-        "0.png: 4 images of 100 x 50 need 0.00 GiB with --downscale 1, more than 75% of the 0.00 GiB that are free"
-    )
-    refuses(message, read_images, paths, 1, keep="memory", error=SceneError)
+    message = "4 images of 100 x 50 need 0.00 GiB with --downscale 1, more than 75% of the 0.00 GiB that are free"
+    refuses(f"0.png: {message}", read_images, paths, 1, keep="memory", error=SceneError)
     assert read_images(paths, 2)[0].shape == (4, 25, 50, 3)
 
 
@@ -145,9 +138,8 @@ def write_profile(primaries):
     def xyz(values):
         return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(65536 * value) for value in values))
 
-    curve = b"curv\0\0\0\0" + struct.pack(
-        ">I1024H", 1024, *np.rint(65535 * to_linear(np.linspace(0, 1, 1024))).astype(int)
-    )
+    values = np.rint(65535 * to_linear(np.linspace(0, 1, 1024))).astype(int)
+    curve = b"curv\0\0\0\0" + struct.pack(">I1024H", 1024, *values)
     tags = {b"desc": b"desc" + bytes(8) + struct.pack(">I", 2) + b"p\0" + bytes(78), b"wtpt": xyz((0.9642, 1, 0.8249))}
     tags |= {name: xyz(row) for name, row in zip((b"rXYZ", b"gXYZ", b"bXYZ"), primaries)}
     tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
@@ -168,13 +160,8 @@ DISPLAY_P3 = ((0.5151, 0.2412, -0.0011), (0.292, 0.6922, 0.0419), (0.1571, 0.066
 def test_colours_of_a_profile_become_srgb(tmp_path, mode, kind):
     """Phones write the colours of Display P3, whose numbers are smaller than in sRGB."""
     values = np.broadcast_to(np.array([200, 80, 60, 100][: len(mode)], dtype=np.uint8), (16, 16, len(mode)))
-    read = {}
-    for name, profile in (
-        ("none", None),
-        ("srgb", write_profile(SRGB)),
-        ("p3", write_profile(DISPLAY_P3)),
-        ("bad", b"x"),
-    ):
+    read, profiles = {}, {"none": None, "srgb": write_profile(SRGB), "p3": write_profile(DISPLAY_P3), "bad": b"x"}
+    for name, profile in profiles.items():
         Image.fromarray(values).save(tmp_path / f"{name}.{kind}", icc_profile=profile, quality=100)
         read[name] = read_image(tmp_path / f"{name}.{kind}", 2)[3, 3].tolist()
     assert read["none"] == read["srgb"] == read["bad"]

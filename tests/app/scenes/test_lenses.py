@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import refuses
-from PIL import Image
-from scene_files import write_colmap, write_images
+from scene_files import oriented, write_colmap, write_frames, write_images
 
 from voronerf.app.scenes import SceneError, load_scene
 from voronerf.app.scenes.lenses import COEFFICIENTS, MODELS, OTHER_MODELS, colmap_lens
@@ -60,27 +59,26 @@ def test_each_image_of_a_folder_has_its_own_model(tmp_path):
                 torch.testing.assert_close(projected, pixels, atol=1e-4, rtol=0)
 
 
-def test_pictures_all_around(tmp_path):
-    """nerfstudio's equirectangular images load: the focal length is ignored, and rays follow the reduced size."""
+@pytest.mark.parametrize(
+    "lens",
+    [{"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32}, {"latlong": True}, {"latlong": 1, "fl_x": None}],
+)
+def test_pictures_all_around(tmp_path, lens):
+    """Equirectangular images of nerfstudio and instant-ngp load; their focal length is ignored."""
     poses = orbit_cameras(3, radius=4, elevation=20, width=1, height=1, focal=1).poses
     write_images(tmp_path, [(64, 32)] * 3)
-    frames = [
-        {"file_path": f"images/{index:02d}.jpg", "transform_matrix": pose.tolist()} for index, pose in enumerate(poses)
-    ]
-    entries = {"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32, "fl_x": 32, "fl_y": 32, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(entries))
+    write_frames(tmp_path, poses, **lens)
     scene = load_scene(tmp_path, downscale=2)
     assert scene.kind == "inside-out" and not any("check the cameras" in note for note in scene.notes)
     write_scene(tmp_path / "scene.json", scene)
     for read in (scene, read_scene(tmp_path / "scene.json")):
         cameras = read.train.cameras
         rays = cameras.image_rays(0)
-        assert (cameras.width, cameras.height) == (32, 16)
+        assert (cameras.width, cameras.height, cameras.models.tolist()) == (32, 16, [3, 3])
         torch.testing.assert_close(rays.directions, Cameras.all_around(cameras.poses, 16).image_rays(0).directions)
 
 
-@pytest.mark.parametrize("height", [32, 40])
-@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(("binary", "height"), [(True, 40), (False, 32)])
 def test_pictures_all_around_of_a_model(tmp_path, binary, height):
     """Equirectangular COLMAP cameras load: their two parameters are the image size, and point depths are distances."""
     poses = orbit_cameras(9, radius=4, elevation=20, width=1, height=1, focal=1).poses
@@ -100,9 +98,7 @@ def test_pictures_all_around_of_a_model(tmp_path, binary, height):
 @pytest.mark.parametrize("tag", [1, 3, 6])
 def test_a_picture_all_around_stands_upright_or_on_its_head(tmp_path, tag):
     poses = orbit_cameras(3, radius=4, elevation=20, width=1, height=1, focal=1).poses
-    exif = Image.Exif()
-    exif[0x0112] = tag
-    write_images(tmp_path, [(64, 32)] * 3, exif=exif)
+    write_images(tmp_path, [(64, 32)] * 3, exif=oriented(tag))
     write_colmap(tmp_path, poses, [(64, 32)] * 3, [], lenses=[("EQUIRECTANGULAR", (64, 32))] * 3)
     if tag == 6:
         refuses("must have no orientation tag of a quarter turn", load_scene, tmp_path, error=SceneError)

@@ -1,22 +1,29 @@
 """Tests of the masks of valid pixels: from mask files, from alpha, and from the image circle of a lens."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers import refuses, trained
+from helpers import all_pairs, refuses, seeded, trained
 from PIL import Image
-from scene_files import COUNT, POINTS, POSES, SIZE, rewrite, write_capture, write_colmap, write_images, write_llff
+from scene_files import (
+    COUNT,
+    POINTS,
+    POSES,
+    SIZE,
+    oriented,
+    rewrite,
+    write_capture,
+    write_colmap,
+    write_frames,
+    write_images,
+    write_llff,
+)
 
 from voronerf.app.scenes import SceneError, load_scene
 from voronerf.app.train import TrainConfig
-from voronerf.app.train.build import (
-    make_batches,
-    make_grid,
-    space_before,
-)
+from voronerf.app.train.build import make_batches, make_grid, space_before
 from voronerf.app.train.defaults import resolve
 from voronerf.nerf.cameras import Cameras, orbit_cameras
 
@@ -51,18 +58,18 @@ def disc(side, radius, columns=0):
 
 
 @pytest.mark.parametrize(
-    ("clear", "kind"),
+    ("clear", "kind", "keep"),
     [
-        (lambda index: (torch.arange(400).view(20, 20) == 57) & (index == 3), "unbounded"),  # one pixel of one image
-        (lambda index: disc(20, 4, columns=index), "unbounded"),  # a person walks through
-        (lambda index: disc(20, 9) & (index in (1, 2)), "unbounded"),  # a person comes near in two images
-        (lambda index: ~disc(20, 12.5), "unbounded"),  # empty corners after undistortion
-        (lambda index: torch.arange(20)[:, None].expand(20, 20) >= 15, "unbounded"),  # a car's bonnet
-        (lambda index: ~disc(20, 6, columns=index - 4), "object"),
-        (lambda index: ~disc(20, 6) if index else ~disc(20, 14), "object"),  # an object that fills one image
+        # one pixel of one image
+        (lambda index: (torch.arange(400).view(20, 20) == 57) & (index == 3), "unbounded", "memory"),
+        (lambda index: disc(20, 4, columns=index), "unbounded", "disk"),  # a person walks through
+        (lambda index: disc(20, 9) & (index in (1, 2)), "unbounded", "memory"),  # a person comes near in two images
+        (lambda index: ~disc(20, 12.5), "unbounded", "memory"),  # empty corners after undistortion
+        (lambda index: torch.arange(20)[:, None].expand(20, 20) >= 15, "unbounded", "memory"),  # a car's bonnet
+        (lambda index: ~disc(20, 6, columns=index - 4), "object", "disk"),
+        (lambda index: ~disc(20, 6) if index else ~disc(20, 14), "object", "memory"),  # an object that fills one image
     ],
 )
-@pytest.mark.parametrize("keep", ["memory", "disk"])
 def test_alpha_cuts_out_an_object_or_masks(tmp_path, monkeypatch, clear, kind, keep):
     monkeypatch.setenv("VORONERF_CACHE", str(tmp_path / "cache"))
     write_capture(tmp_path / "scene", orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=20))
@@ -72,7 +79,8 @@ def test_alpha_cuts_out_an_object_or_masks(tmp_path, monkeypatch, clear, kind, k
         pixels[..., 3] = np.where(opaque, 254 if index == 5 else 255, 0)
         Image.fromarray(pixels).save(tmp_path / f"scene/{index:02d}.png")
     scene = load_scene(tmp_path / "scene", images=keep)
-    masked = any("transparent pixels, in" in note for note in scene.notes)
+    line = f"transparent pixels, in {sum(not bool(each.all()) for each in shown)} of 9 images, are masked"
+    masked = any(line in note for note in scene.notes)  # an alpha of 254 is opaque
     assert (scene.kind, scene.background is None, masked) == (kind, kind != "object", kind != "object")
     for asked in ("unbounded", "object"):
         scene = load_scene(tmp_path / "scene", images=keep, kind=asked)
@@ -114,17 +122,14 @@ def test_alpha_and_masks_count_together_upright_and_reduced(tmp_path):
     refuses("02.png: its alpha excludes all pixels", load_scene, tmp_path, error=SceneError)
 
 
-@pytest.mark.parametrize("tag", [1, 3, 6, 8])
-@pytest.mark.parametrize("upright", [False, True])
-@pytest.mark.parametrize("transparent", [False, True])
+@pytest.mark.parametrize(*all_pairs({"tag": (1, 3, 6, 8), "upright": (False, True), "transparent": (False, True)}))
 def test_a_mask_lies_as_its_image_is_stored_or_as_it_is_seen(tmp_path, tag, upright, transparent):
     write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=12, height=10, focal=12))
-    exif, seen = Image.Exif(), torch.rand((10, 12), generator=torch.Generator().manual_seed(0)) > 0.5
-    exif[0x0112], turns = tag, {1: 0, 3: 2, 6: 3, 8: 1}[tag]
-    stored = torch.rot90(seen, -turns)
+    seen = torch.rand((10, 12), generator=seeded()) > 0.5
+    stored = torch.rot90(seen, -{1: 0, 3: 2, 6: 3, 8: 1}[tag])
     lies = stored if tag == 3 or not upright else seen
     for index in range(9):
-        Image.new("RGB", stored.shape[::-1]).save(tmp_path / f"{index:02d}.jpg", exif=exif)
+        Image.new("RGB", stored.shape[::-1]).save(tmp_path / f"{index:02d}.jpg", exif=oriented(tag))
     mask = Image.fromarray(lies.numpy()).convert("L")
     if transparent:
         white = Image.new("RGBA", mask.size, "white")
@@ -144,10 +149,8 @@ def test_a_mask_lies_as_its_image_is_stored_or_as_it_is_seen(tmp_path, tag, upri
 @pytest.mark.parametrize("tag", [1, 6])
 def test_masks_of_instant_ngp_leave_out_what_is_not_black(tmp_path, format, tag):
     """Masks beside the images, upright or as stored, are found in every format, and are not read as images."""
-    exif, turns = Image.Exif(), {1: 0, 6: 3}[tag]
-    exif[0x0112] = tag
-    write_images(tmp_path, [SIZE] * COUNT, exif=exif)
-    white = torch.rand(SIZE[::-1], generator=torch.Generator().manual_seed(0)) > 0.7
+    white, turns = torch.rand(SIZE[::-1], generator=seeded()) > 0.7, {1: 0, 6: 3}[tag]
+    write_images(tmp_path, [SIZE] * COUNT, exif=oriented(tag))
     for index in range(5):
         lies = torch.rot90(white, turns) if index % 2 else white
         Image.fromarray(lies.numpy()).save(tmp_path / f"images/dynamic_mask_{index:02d}.png")
@@ -156,10 +159,7 @@ def test_masks_of_instant_ngp_leave_out_what_is_not_black(tmp_path, format, tag)
     elif format == "llff":
         write_llff(tmp_path, POSES, SIZE, 20.0, (2.5, 5.5))
     else:
-        frames = [
-            {"file_path": f"images/{index:02d}", "transform_matrix": pose.tolist()} for index, pose in enumerate(POSES)
-        ]
-        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "frames": frames}))
+        write_frames(tmp_path, POSES, "images/{:02d}".format)
     for downscale in (1, 2):
         scene = load_scene(tmp_path, downscale=downscale)
         line = "5 of 9 images have a mask dynamic_mask_NAME.png, whose pixels that are not black do not count"
@@ -196,7 +196,7 @@ def test_a_jpeg_may_be_a_mask(tmp_path):
         (9.0, {"k1": -0.28, "k2": 0.05, "k3": -0.002}, None),
         (11.0, {"k1": -0.2, "p1": 0.004, "p2": -0.003}, None),
         (10.0, {"k1": -0.25, "fl_y": 9.0, "cx": 9.0, "cy": 11.5}, None),
-        (6.0, {"k1": -0.1, "is_fisheye": True}, 7.3),
+        (6.0, {"k1": -0.1, "is_fisheye": True}, 7.3),  # angle t maps to 6 (t - 0.1 t^3) <= 7.3
     ],
 )
 def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
@@ -223,14 +223,11 @@ def test_corners_without_a_ray_are_masked(tmp_path, focal, lens, limit):
     assert seen.sum() > 100 and float((back - directions[seen]).norm(dim=-1).max()) < 1e-3
 
 
-def test_the_corners_that_a_fisheye_does_not_reach_are_left_out(tmp_path):
+def test_corners_without_a_ray_are_neither_trained_nor_scored(tmp_path):
     rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=20, focal=6)
-    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)  # angle t maps to 6 (t - 0.1 t^3) <= 7.3
-    scene = load_scene(tmp_path)
-    y, x = torch.meshgrid(torch.arange(20) - 9.5, torch.arange(20) - 9.5, indexing="ij")
-    assert torch.equal(scene.train.masks[0], torch.hypot(x, y) < 7.3)
+    write_capture(tmp_path, rig, fl_x=6.0, k1=-0.1, is_fisheye=True)
     short = {"steps": 4, "cells": (), "width": 8, "rays": 32, "samples": (8,), "evaluations": 1}
-    summary = trained(TrainConfig(out=tmp_path / "run", **short), scene)
+    summary = trained(TrainConfig(out=tmp_path / "run", **short), load_scene(tmp_path))
     assert 0 < summary["psnr"] < 100 and 0 < summary["ssim"] < 1
 
 
@@ -259,17 +256,12 @@ def test_rays_that_are_none_change_nothing(tmp_path, lens):
     assert int(empty.sum()) > 100 and not (empty & ~looked_through).any()
 
 
-@pytest.mark.parametrize("lens", ["plain", "fisheye"])
-@pytest.mark.parametrize("radius", [6.2, 9.0, 14.0, 40.0])
-@pytest.mark.parametrize("downscale", [1, 2, 3])
-def test_the_circle_of_a_fisheye_is_what_counts(tmp_path, lens, radius, downscale):
-    write_capture(tmp_path, orbit_cameras(9, radius=2, elevation=5, width=20, height=16, focal=10), fl_x=10.0)
-    lens = {"is_fisheye": True} if lens == "fisheye" else {}
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("RGB", (20, 16)).save(tmp_path / "03.jpg", exif=exif)
+@pytest.mark.parametrize(*all_pairs({"fisheye": (False, True), "radius": (6.2, 9.0, 14.0), "downscale": (1, 2, 3)}))
+def test_the_circle_of_a_fisheye_is_what_counts(tmp_path, fisheye, radius, downscale):
+    rig = orbit_cameras(9, radius=2, elevation=5, width=20, height=16, focal=10)
+    write_capture(tmp_path, rig, fl_x=10.0, fisheye_crop_radius=radius, is_fisheye=fisheye)
+    Image.new("RGB", (20, 16)).save(tmp_path / "03.jpg", exif=oriented(6))
     rewrite(tmp_path, lambda contents: contents["frames"][5].update(file_path="03.jpg"))
-    rewrite(tmp_path, lambda contents: contents.update(fisheye_crop_radius=radius, **lens))
     split = load_scene(tmp_path, downscale=downscale).train
     x, y = (downscale * (torch.arange(side // downscale) + 0.5) - side / 2 for side in (20, 16))
     expected = torch.hypot(x, y[:, None]) <= radius

@@ -8,11 +8,9 @@ import os
 import re
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 import time
-import zlib
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ import torch
 from helpers import refuses
 from PIL import ExifTags, Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
-from scene_files import write_images, write_walls
+from scene_files import oriented, write_deep, write_frames, write_images, write_walls
 
 from voronerf.app.cli import main
 from voronerf.app.scenes import SceneError, gather, load_scene, process
@@ -60,14 +58,8 @@ def test_pictures_become_a_scene_that_goes_on_where_it_was_stopped(tmp_path, pic
     with pytest.raises(KeyboardInterrupt):
         process.process(pictures, out, max_features=300, progress=stop)
     assert not (out / "sparse").exists() and set(seen) == {"images", "features", "pairs", "matches"}
-    refuses(
-        "was started with --max-features 300, got 500",
-        process.process,
-        pictures,
-        out,
-        max_features=500,
-        error=SceneError,
-    )
+    line = "was started with --max-features 300, got 500"
+    refuses(line, process.process, pictures, out, max_features=500, error=SceneError)
     with pycolmap.Database.open(out / "colmap/database.db") as opened:
         counts = [len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()]
         assert all(100 < count <= 300 for count in counts)  # SIFT finds more than 300
@@ -166,6 +158,19 @@ def models(tmp_path, monkeypatch, pictures, **results):
     return called
 
 
+@pytest.fixture
+def features(monkeypatch):
+    """A function that processes images up to their features, and opens the database."""
+    monkeypatch.setattr(process, "_map", lambda *_: None)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: None)
+
+    def opened(source, out, **options):
+        refuses("finds no model", process.process, source, out, error=SceneError, **options)
+        return pycolmap.Database.open(out / "colmap/database.db")
+
+    return opened
+
+
 def circle(count=COUNT):
     angles = torch.arange(count) * (2 * torch.pi / count)
     return torch.stack((angles.cos(), angles.sin(), 0 * angles), 1).double()
@@ -233,10 +238,8 @@ def test_cameras_far_from_all_others_count_as_missing():
     assert lost_cameras(together).nonzero().flatten().tolist() == [38, 39]  # two lost cameras side by side
     assert "depths from 0.02 to 3.52e+04" in camera_faults(circle(), torch.tensor([[0.02, 5.0], [1.0, 3.52e4]]))[0]
     lenses = [colmap_lens("OPENCV", (736, 700, 400, 266, 0.1, 0, p1, 0.01)) for p1 in (0.02, -0.09)]
-    assert [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses] == [
-        [],
-        ["a lens is tilted, p1 -0.09 and p2 0.01"],
-    ]
+    faults = [camera_faults(circle(), lenses=[(lens, 800)]) for lens in lenses]
+    assert faults == [[], ["a lens is tilted, p1 -0.09 and p2 0.01"]]
 
 
 def test_cameras_beside_a_burst_are_not_lost():
@@ -305,9 +308,8 @@ def test_lenses_of_one_device_have_similar_focal_lengths():
 def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
     poses = orbit_cameras(8, radius=4, elevation=20, width=12, height=10, focal=20).poses
     poses[:6, :3, 3] = poses[0, :3, 3] + 1e-6 * poses[:6, :3, 3]
-    frames = [{"file_path": f"images/{i:02}.jpg", "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
     write_images(tmp_path, [(12, 10)] * 8)
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
+    write_frames(tmp_path, poses, w=12, h=10)
     notes = load_scene(tmp_path).notes
     assert any(note.startswith("check the cameras: the cameras have collapsed") for note in notes)
 
@@ -315,17 +317,11 @@ def test_a_scene_says_what_is_wrong_with_its_cameras(tmp_path):
 def test_a_lost_camera_does_not_give_a_scene_its_scale(tmp_path):
     poses = orbit_cameras(17, radius=4, elevation=20, width=12, height=10, focal=20).poses
     write_images(tmp_path, [(12, 10)] * 17)
-
-    def write(poses, numbers=range(17)):
-        frames = [
-            {"file_path": f"images/{i:02}.jpg", "transform_matrix": pose.tolist()} for i, pose in zip(numbers, poses)
-        ]
-        (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 20, "w": 12, "h": 10, "frames": frames}))
-
-    write(torch.cat((poses[:3], poses[4:])), [*range(3), *range(4, 17)])
+    others = [*range(3), *range(4, 17)]
+    write_frames(tmp_path, poses[others], lambda index: f"images/{others[index]:02}.jpg", w=12, h=10)
     sound = load_scene(tmp_path)
     poses[3, :3, 3] *= 8000
-    write(poses)
+    write_frames(tmp_path, poses, w=12, h=10)
     scene, kept = load_scene(tmp_path), load_scene(tmp_path, keep_far=True)
     line = "1 of 17 cameras lie far from the others and are"
     assert f"{line} left out (--keep-far keeps them): 03.jpg" in scene.notes
@@ -359,23 +355,16 @@ def test_half_transparent_pixels_have_features(tmp_path):
     assert np.array(Image.open(tmp_path / "features/a.png.png")).tolist() == [[False, True, True]]
 
 
-def test_reduced_images_keep_the_orientation_tag(tmp_path, monkeypatch):
+def test_reduced_images_keep_the_orientation_tag_and_the_transparent_colour_of_a_palette(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "LEAST_SIDE", 4)
-    tag = Image.Exif()
-    tag[0x0112] = 6
-    write_images(tmp_path, [(12, 10)] * 2, exif=tag)
-    process._write_reduced(sorted((tmp_path / "images").iterdir()), tmp_path / "images_2", 2)
-    with Image.open(tmp_path / "images_2/00.jpg") as reduced:
-        assert reduced.size == (6, 5) and reduced.getexif()[0x0112] == 6
-
-
-def test_reduced_images_of_a_palette_keep_their_transparent_colour(tmp_path, monkeypatch):
-    monkeypatch.setattr(process, "LEAST_SIDE", 4)
+    write_images(tmp_path, [(12, 10)] * 2, exif=oriented(6))
     indexed = Image.new("P", (12, 10))
     indexed.putpalette([200, 0, 0, 0, 100, 0])
     indexed.paste(1, (6, 0, 12, 10))
-    indexed.save(path := tmp_path / "a.png", transparency=1)
-    process._write_reduced([path], tmp_path / "images_2", 2)
+    indexed.save(tmp_path / "images/a.png", transparency=1)
+    process._write_reduced(sorted((tmp_path / "images").iterdir()), tmp_path / "images_2", 2)
+    with Image.open(tmp_path / "images_2/00.jpg") as reduced:
+        assert reduced.size == (6, 5) and reduced.getexif()[0x0112] == 6
     with Image.open(tmp_path / "images_2/a.png") as reduced:
         assert reduced.size == (6, 5) and reduced.getpixel((0, 0)) == (200, 0, 0, 255)
         assert reduced.getpixel((5, 0))[3] == 0
@@ -385,6 +374,7 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
     write_images(tmp_path, [(12, 10)] * 2)
     (tmp_path / "text.mp4").write_text("no video")
     (tmp_path / "list.mp4").write_text(f"ffconcat version 1.0\nfile {tmp_path}/images/00.jpg\n")
+    (tmp_path / "cut.mp4").write_bytes(b"\0\0\0\x10ftypisom\0\0\0\0")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/notes.txt").write_text("keep")
     before = sorted(tmp_path.rglob("*"))
@@ -392,16 +382,17 @@ def test_what_cannot_become_a_scene_is_one_line_and_leaves_nothing(tmp_path, mon
         ("nowhere", "there is no such video or folder"),
         ("text.mp4", "text.mp4: must be a video in a supported container"),
         ("list.mp4", "list.mp4: must be a video in a supported container"),
+        ("cut.mp4", "moov atom not found, as in a recording or a download that was cut off"),
         ("images", "must have at least 3 images, got 2"),
         ("", f"{tmp_path}/images: must have at least 3 images, got 2"),
         ("full", f"{tmp_path}/full: must have at least 3 images, got 0"),
     ):
         refuses(reason, process.process, tmp_path / source, tmp_path / "out", error=SceneError)
-    refuses(
-        "full: must be a new or empty folder", process.process, tmp_path / "images", tmp_path / "full", error=SceneError
-    )
+    reason = "full: must be a new or empty folder"
+    refuses(reason, process.process, tmp_path / "images", tmp_path / "full", error=SceneError)
     refuses("matching must be one of auto", process.process, tmp_path, tmp_path / "out", matching="all")
     refuses("max_features must be at least 100, got 5", process.process, tmp_path, tmp_path / "out", max_features=5)
+    refuses("size must be at least 64, got 9", process.process, tmp_path, tmp_path / "out", size=9)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -522,6 +513,11 @@ def gathered(tmp_path, monkeypatch, files):
     return sorted(path.name for path in (out / "images").iterdir()), list(before)
 
 
+THREE, IN_A = ["0.jpg", "1.jpg", "2.jpg"], ["a_0.jpg", "a_1.jpg", "a_2.jpg"]
+SYSTEM = "a/._0.jpg", "a/.DS_Store", "a/Thumbs.db", "a/desktop.ini", "__MACOSX/0.jpg", ".trash/0.jpg", "@eaDir/0/1.jpg"
+POLYCAM = "k/images/{}.jpg", "k/corrected_images/{}.jpg", "k/confidence/{}.png", "k/depth/{}.png"
+
+
 def numbered(*patterns, first=0, count=3):
     """Returns {file name: picture number} for `count` names of each pattern, all with different pictures."""
     names = [pattern.format(number) for pattern in patterns for number in range(count)]
@@ -537,47 +533,30 @@ def numbered(*patterns, first=0, count=3):
             ["the images come from cam B (3), camA (3)"],
         ),
         (numbered("a/b/{}.png"), ["a_b_0.png", "a_b_1.png", "a_b_2.png"], []),
-        (numbered("images/{}.jpg", "images_2/{}.jpg", "depth/{}.png"), ["0.jpg", "1.jpg", "2.jpg"], []),
-        (
-            numbered("Images/{}.jpg", "more/{}.jpg"),
-            ["0.jpg", "1.jpg", "2.jpg"],
-            ["3 images outside of Images are left out"],
-        ),
+        (numbered("images/{}.jpg", "images_2/{}.jpg", "depth/{}.png"), THREE, []),
+        (numbered("Images/{}.jpg", "more/{}.jpg"), THREE, ["3 images outside of Images are left out"]),
         (numbered("{}.JPG", "more/{}.jpg"), ["0.JPG", "1.JPG", "2.JPG"], ["3 images in subfolders are left out"]),
         (
             numbered("{}.jpg", "{}.png", "{}.webp", "b{}.webp", "b{}.tif"),
             ["0.jpg", "1.jpg", "2.jpg", "b0.png", "b1.png", "b2.png"],
             ["9 images are left out, since they also exist in another format: 0.png, 1.png, 2.png, 0.webp"],
         ),
-        (numbered("{}.webp"), ["0.jpg", "1.jpg", "2.jpg"], []),
+        (numbered("{}.webp"), THREE, []),
         (numbered("{}.tif", "b{}.TIFF", "c{}.bmp"), [f"{c}{i}.png" for c in ("", "b", "c") for i in range(3)], []),
         (
             {**numbered("{}.jpg"), "0 (1).jpg": 0, "copy of 1.jpg": 1, "b/2.jpg": 2},
-            ["0.jpg", "1.jpg", "2.jpg"],
+            THREE,
             ["1 images in subfolders", "2 byte-identical copies of images are left out: 0_(1).jpg, copy_of_1.jpg"],
         ),
         (
             {**numbered("{}.jpg"), "1.dng": b"raw", "2.dng": b"raw", "0.mov": b"live", "LICENSE": b"words"},
-            ["0.jpg", "1.jpg", "2.jpg"],
+            THREE,
             ["other files than PNG, JPEG, WebP, TIFF, BMP and HEIC are left out: 2 .dng, 1 .mov, 1 LICENSE"],
         ),
-        (
-            {
-                **numbered("a/{}.jpg"),
-                **dict.fromkeys(("a/._0.jpg", "a/.DS_Store", "a/Thumbs.db", "a/desktop.ini"), b"system"),
-                **dict.fromkeys(("__MACOSX/a/._0.jpg", "a/@eaDir/0.jpg/SYNO_XL.jpg", ".trash/0.jpg"), b"system"),
-                **numbered("old/images/{}.jpg", first=9),
-                "old/colmap/settings.json": b"{}",
-            },
-            ["a_0.jpg", "a_1.jpg", "a_2.jpg"],
-            [],
-        ),
-        (
-            numbered("k/images/{}.jpg", "k/corrected_images/{}.jpg", "k/confidence/{}.png", "k/depth/{}.png"),
-            [f"k_corrected_images_{i}.jpg" for i in range(3)],
-            [],
-        ),
-        (numbered("images/{}.jpg", "corrected_images/{}.jpg"), ["0.jpg", "1.jpg", "2.jpg"], []),
+        ({**numbered("a/{}.jpg"), **dict.fromkeys(SYSTEM, b"system")}, IN_A, []),
+        ({**numbered("a/{}.jpg", "b/images/{}.jpg"), "b/colmap/settings.json": b"{}"}, IN_A, []),
+        (numbered(*POLYCAM), [f"k_corrected_images_{i}.jpg" for i in range(3)], []),
+        (numbered("images/{}.jpg", "corrected_images/{}.jpg"), THREE, []),
         (numbered("#{}.jpg", "a #{}.jfif"), [*(f"_{i}.jpg" for i in range(3)), *(f"a_#{i}.jpg" for i in range(3))], []),
     ],
 )
@@ -646,24 +625,6 @@ def test_transparent_images_stay_transparent(tmp_path, name):
         assert copy.suffix == ".png" and kept.mode == "RGBA" and kept.getpixel((4, 4))[3] == 77
 
 
-def write_deep(path, values):
-    """Writes 16-bit colours [h, w, 3] as PNG or TIFF."""
-    height, width, _ = values.shape
-    if path.suffix == ".png":
-        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-        header = struct.pack(">2I5B", width, height, 16, 2, 0, 0, 0)
-        parts = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
-        chunks = [struct.pack(">I", len(part)) + kind + part for kind, part in parts]
-        checked = [chunk + struct.pack(">I", zlib.crc32(chunk[4:])) for chunk in chunks]
-        path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(checked))
-    else:
-        tags = {256: width, 257: height, 258: 122, 259: 1, 262: 2, 273: 128, 277: 3, 278: height, 279: values.size * 2}
-        counts = [(tag, 3, 3 if tag == 258 else 1, value) for tag, value in tags.items()]
-        entries = b"".join(struct.pack("<2H2I", *each) for each in counts)
-        start = b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + b"\0" * 4
-        path.write_bytes(start.ljust(122, b"\0") + struct.pack("<3H", 16, 16, 16) + values.astype("<u2").tobytes())
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_of_16_bits_a_channel_8_are_kept(tmp_path, monkeypatch, suffix):
     models(tmp_path, monkeypatch, None, **{"global": None, "incremental": None})
@@ -711,11 +672,8 @@ def clear(mask):
         ({**numbered("{}.jpg"), "masks/1.png": clear(half())}, ["1.jpg"], "1 of 3 images have a mask"),
         ({**numbered("{}.tif"), "masks/1.png": half().convert("P")}, ["1.png"], "1 of 3 images have a mask"),
         ({**numbered("{}.jpg"), "../masks/1.png": half().convert("RGBA")}, ["1.jpg"], "1 of 3 images have a mask"),
-        (
-            {**numbered("{}.jpg"), "0 2.jpg": 0, **dict.fromkeys(("masks/0.png", "masks/0 2.png"), half())},
-            ["0.jpg"],
-            "1 of 3",
-        ),
+        ({**numbered("{}.jpg"), "0 2.jpg": 0, "masks/0.png": half(), "masks/0 2.png": half()}, ["0.jpg"], "1 of 3"),
+        ({**numbered("images/{}.jpg"), "images/dynamic_mask_1.png": ImageOps.invert(half())}, ["1.jpg"], "1 of 3"),
         ({**numbered("{}.jpg"), "masks/mask_1.png": half()}, [], "masks: has no mask of any image; the mask of 0.jpg"),
         (numbered("{}.jpg"), [], ""),
     ],
@@ -733,9 +691,8 @@ def test_masks_go_along(tmp_path, monkeypatch, files, names, line):
 
 @pytest.mark.parametrize("tag", [6, 8])
 def test_masks_drawn_on_turned_photographs_lie_as_the_photographs_are_stored(tmp_path, monkeypatch, tag):
-    exif, photograph, upright = Image.Exif(), io.BytesIO(), half()
-    exif[0x0112] = tag
-    picture(1).save(photograph, "JPEG", exif=exif)
+    photograph, upright = io.BytesIO(), half()
+    picture(1).save(photograph, "JPEG", exif=oriented(tag))
     upright.getexif()[0x0112] = tag
     files = {**numbered("{}.jpg"), "1.jpg": photograph.getvalue(), "masks/1.png": ImageOps.exif_transpose(upright)}
     gathered(tmp_path, monkeypatch, files)
@@ -765,7 +722,7 @@ def test_a_mask_that_does_not_fit_leaves_nothing(tmp_path, mask, reason):
     assert not (tmp_path / "out").exists()
 
 
-def test_masked_parts_have_no_features_and_do_not_train(tmp_path, pictures):
+def test_masked_and_transparent_parts_have_no_features_and_do_not_train(tmp_path, pictures):
     (tmp_path / "in/masks/b").mkdir(parents=True)
     for number, path in enumerate(sorted(pictures.iterdir())):
         (tmp_path / f"in/{'ab'[number // 4]}").mkdir(exist_ok=True)
@@ -773,18 +730,24 @@ def test_masked_parts_have_no_features_and_do_not_train(tmp_path, pictures):
     mask = Image.new("1", (WIDTH, HEIGHT), 1)
     mask.paste(0, (0, 0, WIDTH // 4, HEIGHT))
     mask.save(tmp_path / "in/masks/b/5.png")
+    with Image.open(tmp_path / "in/a/2.png") as image:  # its right half is transparent
+        image.putalpha(Image.fromarray(np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2).convert("L"))
+        image.save(tmp_path / "in/a/2.png")
     out = tmp_path / "out"
     process.process(tmp_path / "in", out, max_features=300)
     with pycolmap.Database.open(out / "colmap/database.db") as opened:
         images = sorted(opened.read_all_images(), key=lambda image: image.name)
-        leftmost = [opened.read_keypoints(image.image_id)[:, 0].min() for image in images]
-    assert [x > WIDTH // 4 - 1 for x in leftmost] == [number == 5 for number in range(COUNT)]
+        columns = [opened.read_keypoints(image.image_id)[:, 0] for image in images]
+    assert [x.min() > WIDTH // 4 - 1 for x in columns] == [number == 5 for number in range(COUNT)]
+    assert [x.max() < WIDTH // 2 + 1 for x in columns] == [number == 2 for number in range(COUNT)]
+    assert min(map(len, columns)) > 50
     scene = load_scene(out, format="transforms")
     names = [f"{'ab'[number // 4]}_{number}" for number in range(COUNT)]
     assert sorted([*scene.train.names, *scene.test.names]) == names
     masks = {name: split.mask(i) for split in (scene.train, scene.test) for i, name in enumerate(split.names)}
-    assert [bool(masks[name].all()) for name in names] == [number != 5 for number in range(COUNT)]
+    assert [bool(masks[name].all()) for name in names] == [number not in (2, 5) for number in range(COUNT)]
     assert not masks["b_5"][:, : WIDTH // 4].any() and masks["b_5"][:, WIDTH // 4 :].all()
+    assert not masks["a_2"][:, WIDTH // 2 :].any() and masks["a_2"][:, : WIDTH // 2].all()
 
 
 def test_pycolmap_is_needed_once_the_images_were_looked_at(tmp_path, monkeypatch):
@@ -798,23 +761,6 @@ def test_pycolmap_is_needed_once_the_images_were_looked_at(tmp_path, monkeypatch
     refuses("finds no model", process.process, tmp_path, tmp_path / "out", error=SceneError)
 
 
-def test_images_of_one_size_share_a_camera(tmp_path, pictures, monkeypatch):
-    (tmp_path / "mixed").mkdir()
-    for number, path in enumerate(sorted(pictures.iterdir())[:6]):
-        with Image.open(path) as image:  # every third image is upright
-            image.rotate(90 * (number % 3 == 0), expand=True).save(tmp_path / f"mixed/{number}.png")
-    monkeypatch.setattr(process, "_map", lambda *_: None)
-    said = []
-    with pytest.raises(SceneError, match="finds no model"):
-        process.process(tmp_path / "mixed", tmp_path / "out", max_features=100, say=said.append)
-    sizes = f"4 of {WIDTH} x {HEIGHT}, 2 of {HEIGHT} x {WIDTH}"
-    assert said[0].startswith(f"6 images with 2 cameras: {sizes}; ")
-    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
-        cameras = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
-        taken = [cameras[opened.read_image_with_name(f"{number}.png").camera_id] for number in range(6)]
-    assert len(cameras) == 2 and taken == 2 * [(HEIGHT, WIDTH), (WIDTH, HEIGHT), (WIDTH, HEIGHT)]
-
-
 def with_lens(image, path, focal):
     """Saves a JPEG with EXIF tags of a phone and, unless ``focal`` is None, of a focal length in 35 mm film."""
     exif = Image.Exif()
@@ -825,22 +771,22 @@ def with_lens(image, path, focal):
     image.convert("RGB").save(path, exif=exif)
 
 
-def test_each_lens_has_a_camera(tmp_path, pictures, monkeypatch):
-    """Phones write images of 1x and 2x in one size; without tags, each folder counts as a lens."""
-    folders = [("all/1x_{}.jpg", 26), ("all/2x_{}.jpg", 52), ("a/{}.jpg", None), ("b/{}.jpg", None)]
-    for number, path in enumerate(sorted(pictures.iterdir())[:8]):
-        name, focal = folders[number % 4]
-        with Image.open(path) as image:
-            with_lens(image, tmp_path / "in" / name.format(number), focal)
-    monkeypatch.setattr(process, "_map", lambda *_: None)
+def test_each_lens_has_a_camera(tmp_path, pictures, features):
+    """Phones write images of 1x and 2x in one size; without tags, each folder and size counts as a lens."""
+    lenses = {"all/1x_{}.jpg": 26, "all/2x_{}.jpg": 52, "a/{}.jpg": None, "a/upright_{}.jpg": None, "b/{}.jpg": None}
+    for number, (name, focal) in enumerate(itertools.chain(*[lenses.items()] * 2)):
+        with Image.open(pictures / f"{number % COUNT:02} a.png") as image:
+            turned = image.rotate(90 * ("upright" in name), expand=True)
+            with_lens(turned, tmp_path / "in" / name.format(number), focal)
     said = []
-    with pytest.raises(SceneError, match="finds no model"):
-        process.process(tmp_path / "in", tmp_path / "out", max_features=100, say=said.append)
-    line = next(line for line in said if "8 images with 4 cameras" in line)
-    assert all(f"2 of {WIDTH} x {HEIGHT}, {lens}" in line for lens in ("Phone 26 mm", "Phone 52 mm", "in a", "in b"))
-    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
+    with features(tmp_path / "in", tmp_path / "out", max_features=100, say=said.append) as opened:
+        sizes = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         taken = {image.name[:-5]: image.camera_id for image in opened.read_all_images()}
-    assert len(taken) == len(set(taken.values())) == 4
+    line = next(line for line in said if "10 images with 5 cameras" in line)
+    assert all(f"2 of {WIDTH} x {HEIGHT}, {lens}" in line for lens in ("Phone 26 mm", "Phone 52 mm", "in a", "in b"))
+    assert f"2 of {HEIGHT} x {WIDTH}, in a" in line
+    assert len(taken) == len(set(taken.values())) == len(sizes) == 5
+    assert [name for name, camera in taken.items() if sizes[camera] == (HEIGHT, WIDTH)] == ["a_upright_"]
 
 
 @pytest.mark.parametrize("focal", [0, IFDRational(1, 0), IFDRational(0, 0), -5, "x"])
@@ -873,42 +819,22 @@ def test_other_files_are_not_taken_for_those_of_a_stopped_process(tmp_path, monk
     refuses("was started with other files in", process.process, few, tmp_path / "out", error=SceneError)
 
 
-def test_features_are_searched_in_smaller_images(tmp_path, pictures, monkeypatch):
+def test_features_are_searched_in_smaller_images(tmp_path, pictures, features):
     sizes = []
-    monkeypatch.setattr(process, "_map", lambda *_: None)
     for size in (1600, 100):
-        out = tmp_path / str(size)
-        refuses("no model", process.process, pictures, out, max_features=300, size=size, error=SceneError)
-        with pycolmap.Database.open(out / "colmap/database.db") as opened:
+        with features(pictures, tmp_path / str(size), max_features=300, size=size) as opened:
             sizes.append(min(len(opened.read_keypoints(image.image_id)) for image in opened.read_all_images()))
     assert sizes[1] < 0.95 * sizes[0]
-    refuses("with --size 100, got 90", process.process, pictures, out, max_features=300, size=90, error=SceneError)
-    refuses("size must be at least 64, got 9", process.process, pictures, tmp_path / "new", size=9)
-
-
-def test_transparent_parts_have_no_features(tmp_path, pictures, monkeypatch):
-    (cut := tmp_path / "cut").mkdir()
-    for number, path in enumerate(sorted(pictures.iterdir())):
-        with Image.open(path) as image:  # the first image stays opaque
-            if number:
-                alpha = Image.fromarray(np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2)
-                image.putalpha(alpha.convert("L"))
-            image.save(cut / f"{number}.png")
-    monkeypatch.setattr(process, "_map", lambda *_: None)
-    refuses("no model", process.process, cut, tmp_path / "out", max_features=300, error=SceneError)
-    with pycolmap.Database.open(tmp_path / "out/colmap/database.db") as opened:
-        images = sorted(opened.read_all_images(), key=lambda image: image.name)
-        right = [opened.read_keypoints(image.image_id)[:, 0].max() > WIDTH // 2 + 1 for image in images]
-        counts = [opened.num_keypoints_for_image(image.image_id) for image in images]
-    assert right == [True] + (COUNT - 1) * [False] and min(counts) > 50
+    again = {"max_features": 300, "size": 90}
+    refuses("with --size 100, got 90", process.process, pictures, tmp_path / "100", error=SceneError, **again)
 
 
 def test_a_background_that_stands_still_is_said(tmp_path, pictures, monkeypatch):
-    monkeypatch.setattr(process, "_map", lambda *_: None)
+    models(tmp_path, monkeypatch, pictures, **{"global": None, "incremental": None})
     for still, lines in ((3, 0), (8, 1)):
         monkeypatch.setattr(process, "still_pairs", lambda _, still=still: (still, 28))
         out, said = tmp_path / f"{still}", []
-        refuses("no model", process.process, pictures, out, max_features=300, say=said.append, error=SceneError)
+        refuses("no model", process.process, pictures, out, say=said.append, error=SceneError)
         assert sum(f"{still} of 28 pairs show a static background" in line for line in said) == lines
 
 
@@ -948,7 +874,7 @@ def test_an_image_that_cannot_be_read_is_one_line_and_leaves_nothing(tmp_path, p
         assert not (tmp_path / "out").exists()
 
 
-def test_pictures_with_few_features_are_enlarged(tmp_path, pictures, monkeypatch):
+def test_pictures_with_few_features_are_enlarged(tmp_path, pictures, features, monkeypatch):
     octaves, extract = [], pycolmap.extract_features
 
     def recorded(*arguments, extraction_options, **more):
@@ -956,10 +882,8 @@ def test_pictures_with_few_features_are_enlarged(tmp_path, pictures, monkeypatch
         extract(*arguments, extraction_options=extraction_options, **more)
 
     monkeypatch.setattr(pycolmap, "extract_features", recorded)
-    monkeypatch.setattr(process, "_map", lambda *_: None)
     for most, octave in ((100, 0), (8192, -1)):
         octaves.clear()
-        with pytest.raises(SceneError, match="finds no model"):
-            process.process(pictures, tmp_path / str(most), max_features=most, matching="sequential")
+        features(pictures, tmp_path / str(most), max_features=most, matching="sequential").close()
         assert octaves[0] == 0 and set(octaves[1:]) == {octave}
         assert not list(tmp_path.rglob("tried.db*"))

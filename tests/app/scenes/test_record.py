@@ -26,21 +26,13 @@ def assert_same(one, other):
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, field.name
 
 
-@pytest.mark.parametrize(
-    "contraction",
-    [
-        None,
-        Contraction(torch.tensor([0.1, 0.2, 0.3]), 1.5),
-        Perspective(torch.zeros(3), torch.eye(3), near=0.7, slopes=(0.5, 0.4)),
-    ],
-)
+SPACES = Contraction(torch.tensor([0.1, 0.2, 0.3]), 1.5), Perspective(torch.zeros(3), torch.eye(3), 0.7, (0.5, 0.4))
+
+
+@pytest.mark.parametrize("contraction", [None, *SPACES])
 def test_what_is_written_is_read(tmp_path, scene, contraction) -> None:
-    cameras = replace(
-        scene.train.cameras,
-        distortion=torch.rand(4, 8),
-        models=torch.tensor([0, 2, 1, 0], dtype=torch.int32),
-        sizes=torch.tensor([[12, 12], [12, 10], [8, 12], [12, 12]]),
-    )
+    lenses = {"distortion": torch.rand(4, 8), "models": torch.tensor([0, 2, 1, 0], dtype=torch.int32)}
+    cameras = replace(scene.train.cameras, sizes=torch.tensor([[12, 12], [12, 10], [8, 12], [12, 12]]), **lenses)
     whole = replace(scene, contraction=contraction, box=None, train=replace(scene.train, cameras=cameras))
     for written in (scene, whole):
         write_scene(tmp_path / "scene.json", written)
@@ -67,10 +59,7 @@ def test_what_is_written_is_read(tmp_path, scene, contraction) -> None:
         (lambda values: values["train"].update(poses=[float("nan")]), "poses must be finite"),
         (lambda values: values["train"].update(poses="all"), "record of a scene"),
         (lambda values: values["train"].update(width=1e9), "width and height must be integers, got 1000000000.0"),
-        (
-            lambda values: values["test"].update(names=[]),
-            "names must be as many as poses and at least one, got 0 and 2",
-        ),
+        (lambda values: values["test"].update(names=[]), "must be as many as poses and at least one, got 0 and 2"),
         (lambda values: values.update(contraction={"kind": "odd"}), "record of a scene"),
         (lambda values: values.update(train=[]), "record of a scene"),
     ],

@@ -15,6 +15,7 @@ from PIL import Image
 from scene_files import write_walls
 
 from voronerf.app.scenes import SceneError, process
+from voronerf.app.scenes.results import read_pairs
 from voronerf.nerf.cameras import orbit_cameras
 
 pycolmap = pytest.importorskip("pycolmap", reason="voronerf process needs pycolmap")
@@ -52,10 +53,6 @@ def resumed(finished, stopped, monkeypatch):
         return said
 
     return resume
-
-
-def test_an_unchanged_folder_continues(stopped, resumed):
-    assert resumed()[-1].startswith(f"wrote {stopped}: cameras of 8 of 8 images")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege")
@@ -96,14 +93,14 @@ def test_settings(stopped, resumed, content, message):
     refuses(message, resumed, error=SceneError)
 
 
-@pytest.mark.parametrize(
-    "content",
-    ['{"a": 1}', "[3]", '[["00_a.png"]]', '[["00_a.png", 3]]', '[["00_a.png", "../x"]]', '[["00_a.png", []]]', "["],
-)
-def test_pairs(stopped, resumed, content):
-    path = stopped / "colmap/pairs.json"
-    path.write_text(content)
-    refuses(f"{path}: ", resumed, error=SceneError)
+def test_pairs(stopped, resumed):
+    path, names = stopped / "colmap/pairs.json", [path.name for path in (stopped / "images").iterdir()]
+    assert len(read_pairs(path, names)) > 8
+    for content in ('{"a": 1}', "[3]", '[["00_a.png"]]', '[["00_a.png", 3]]', '[["00_a.png", []]]', "["):
+        path.write_text(content)
+        refuses(f"{path}: ", read_pairs, path, names, error=SceneError)
+    path.write_text('[["00_a.png", "../x"]]')
+    refuses(f"{path}: must have pairs of names of images, got ['00_a.png', '../x']", resumed, error=SceneError)
 
 
 #: Changes of the database by SQL, and the error messages. Without checks, some of them end COLMAP by a signal.
@@ -130,9 +127,12 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize(("change", "message"), CHANGES.items(), ids=range(len(CHANGES)))
-@pytest.mark.parametrize("name", ["database", "few"])
-def test_databases(stopped, resumed, change, message, name):
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [("database", *change) for change in CHANGES.items()] + [("few", *list(CHANGES.items())[n]) for n in (1, -1)],
+    ids=range(len(CHANGES) + 2),
+)
+def test_databases(stopped, resumed, name, change, message):
     shutil.rmtree(stopped / "colmap/global")
     (stopped / "colmap/pairs.json").unlink()
     with contextlib.closing(sqlite3.connect(stopped / f"colmap/{name}.db")) as opened:
@@ -154,24 +154,21 @@ def test_damaged_databases(stopped, resumed, size):
 def test_files_of_rigs_are_not_read(stopped, resumed):
     for name in ("rigs", "frames"):
         (stopped / f"colmap/global/0/{name}.bin").write_bytes(b"\xff" * 999)
-    assert resumed()[-1].startswith("wrote ")
+    assert resumed()[-1].startswith(f"wrote {stopped}: cameras of 8 of 8 images")
 
 
-@pytest.mark.parametrize(("old", "new"), [(b"01_a.png", b"02_a.png"), (b"01_a.png", b"../../xy")])
-def test_a_model_of_other_images_is_no_model(stopped, resumed, old, new):
-    path = stopped / "colmap/global/0/images.bin"
-    path.write_bytes(path.read_bytes().replace(old, new))
-    with pytest.raises(SceneError, match="finds no model"):
-        resumed()
-
-
-def test_a_model_whose_points_are_of_no_image_is_no_model(stopped, resumed):
-    path = stopped / "colmap/global/0/points3D.bin"
-    data = bytearray(path.read_bytes())
-    data[8 + 51 : 8 + 55] = b"\x77" * 4  # the number of the image of the first observation
-    path.write_bytes(data)
-    with pytest.raises(SceneError, match="finds no model"):
-        resumed()
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("images", lambda data: data.replace(b"01_a.png", b"02_a.png")),
+        ("images", lambda data: data.replace(b"01_a.png", b"../../xy")),
+        ("points3D", lambda data: data[: 8 + 51] + b"\x77" * 4 + data[8 + 55 :]),  # the image of an observation
+    ],
+)
+def test_a_model_of_other_images_is_no_model(stopped, resumed, file, change):
+    path = stopped / f"colmap/global/0/{file}.bin"
+    path.write_bytes(change(path.read_bytes()))
+    refuses("finds no model", resumed, error=SceneError)
 
 
 def test_masks(stopped, resumed):

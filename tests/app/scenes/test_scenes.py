@@ -1,5 +1,6 @@
 """Tests of loading valid scenes: cameras match images, normalisation, splits."""
 
+import functools
 import json
 import logging
 import math
@@ -69,39 +70,16 @@ def test_a_capture_that_others_split(tmp_path):
         assert b.cameras.distortion is not None and float(b.cameras.distortion[0, 0]) == pytest.approx(0.02)
 
 
-def test_files_from_elsewhere(tmp_path):
-    """A scene may have Windows separators, a byte order mark, repeated stems and upper-case suffixes."""
-    original = builtin_scene(16, train_views=4, test_views=1)
-    write_blender(tmp_path, original, 0.6911112)
-
-    def move(contents):
-        for index, frame in enumerate(contents["frames"]):
-            folder = tmp_path / f"cam{index % 2}"
-            folder.mkdir(exist_ok=True)
-            picture = Image.open(tmp_path / f"{frame['file_path']}.png").convert("RGB")
-            picture.save(folder / f"{index // 2}.JPEG")
-            frame["file_path"] = f".\\cam{index % 2}\\{index // 2}"
-
-    rewrite(tmp_path, move, "transforms_train", encoding="utf-8-sig")
-    (tmp_path / "test" / "r_0.png").unlink()
-    Image.fromarray(original.test.images[0, ..., :3].numpy()).save(tmp_path / "test" / "r_0.png")
-    assert load_scene(tmp_path).train.names == ("cam0_0", "cam1_0", "cam0_1", "cam1_1")
-
-
-def test_val_stands_in_for_test(tmp_path):
-    write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=3), 0.69)
-    (tmp_path / "transforms_test.json").rename(tmp_path / "transforms_val.json")
-    assert len(load_scene(tmp_path).test) == 3
+built_in = functools.cache(builtin_scene)
 
 
 def blender_nerf(folder, test, lens):
     """Writes a scene as BlenderNeRF exports it: test views, if any, are listed without images."""
-    write_blender(folder, builtin_scene(8, train_views=9, test_views=2), 0.69)
+    write_blender(folder, built_in(8, train_views=9, test_views=2), 0.69)
     if lens:
+        more = {"fl_x": 11.1, "cx": 4.0, "k1": 0.0, "aabb_scale": 4}
         for name in ("train", "test"):
-            rewrite(
-                folder, lambda contents: contents.update(fl_x=11.1, cx=4.0, k1=0.0, aabb_scale=4), f"transforms_{name}"
-            )
+            rewrite(folder, lambda contents: contents.update(more), f"transforms_{name}")
     if test == "none":
         (folder / "transforms_test.json").unlink()
     elif test == "those for training":
@@ -114,8 +92,16 @@ def blender_nerf(folder, test, lens):
         shutil.rmtree(folder / "test")
 
 
-@pytest.mark.parametrize("lens", [True, False])
-@pytest.mark.parametrize("test", ["not rendered", "none", "those for training", "val"])
+@pytest.mark.parametrize(
+    ("test", "lens"),
+    [
+        ("not rendered", True),
+        ("none", False),
+        ("those for training", False),
+        ("val", True),
+        ("val", False),
+    ],
+)
 def test_without_pictures_for_testing_every_eighth_is_held_out(tmp_path, test, lens):
     blender_nerf(tmp_path, test, lens)
     scene = load_scene(tmp_path)
@@ -123,9 +109,12 @@ def test_without_pictures_for_testing_every_eighth_is_held_out(tmp_path, test, l
     assert (scene.background, scene.box is None, held) == ("white", False, test != "val")
     assert scene.test.names == (("r_0", "r_8") if held else ("val_r_0", "val_r_1") if lens else ("r_0", "r_1"))
     assert len(scene.train) == (7 if held else 9)
+    if test == "val":
+        (tmp_path / "transforms_test.json").unlink()
+        assert load_scene(tmp_path).test.names == scene.test.names
 
 
-@pytest.mark.parametrize("start", ["./", "/home/me/lego/", "E:\\lego\\", ""])
+@pytest.mark.parametrize("start", ["./", "/home/me/lego/", "E:\\lego\\"])
 def test_a_picture_of_another_split_is_not_taken(tmp_path, start):
     """A missing test image never becomes a training image of the same name, on whatever machine they were listed."""
     blender_nerf(tmp_path, "not rendered", lens=False)
@@ -140,7 +129,8 @@ def test_a_picture_of_another_split_is_not_taken(tmp_path, start):
     assert scene.test.names == ("r_0", "r_8") and len(scene.train) == 7
     rewrite(tmp_path, lambda contents: [frame.update(time=0.25) for frame in contents["frames"]], "transforms_train")
     assert not any("times" in note for note in load_scene(tmp_path).notes)
-    rewrite(tmp_path, lambda contents: contents["frames"][3].update(time=0.5), "transforms_train")
+    marked = {"encoding": "utf-8-sig"}  # with a byte order mark
+    rewrite(tmp_path, lambda contents: contents["frames"][3].update(time=0.5), "transforms_train", **marked)
     assert "its times are not used: the scene is taken as still" in load_scene(tmp_path).notes
     (tmp_path / "train").rename(tmp_path / "test")
     refuses("transforms_train.json: none of its 9 images exists", load_scene, tmp_path, error=SceneError)
@@ -197,9 +187,7 @@ def test_capture(tmp_path, caplog):
     torch.testing.assert_close(cameras.origins.norm(dim=-1), torch.ones(15), atol=1e-4, rtol=0)
     # The normalisation is rigid: neighbours stay 18 degrees apart.
     by_name = dict(zip(scene.train.names, cameras.forward))
-    angle = math.degrees(math.acos(float(by_name["01"] @ by_name["02"])))
-    before = math.degrees(math.acos(float(orbit.forward[1] @ orbit.forward[2])))
-    assert angle == pytest.approx(before, abs=0.05)
+    assert float(by_name["01"] @ by_name["02"]) == pytest.approx(float(orbit.forward[1] @ orbit.forward[2]), abs=2e-4)
 
 
 @pytest.mark.parametrize("rig", ["outward", "parallel", "one place"])
@@ -235,12 +223,11 @@ def test_names_of_a_capture_are_all_different(tmp_path):
     write_capture(tmp_path, orbit_cameras(8, radius=2, elevation=5, width=4, height=4, focal=4))
     path = tmp_path / "transforms.json"
     contents = json.loads(path.read_text())
-    original = [frame["file_path"] for frame in contents["frames"]]
     left_right = [f"{side}/{index:02d}.png" for side in ("left", "right") for index in range(4)]
     for side in ("left", "right"):
         (tmp_path / side).mkdir()
-    for frame, name, source in zip(contents["frames"], left_right, original):
-        (tmp_path / source).rename(tmp_path / name)
+    for frame, name in zip(contents["frames"], left_right):
+        (tmp_path / frame["file_path"]).rename(tmp_path / name)
         frame["file_path"] = name
     path.write_text(json.dumps(contents))
 
@@ -249,10 +236,6 @@ def test_names_of_a_capture_are_all_different(tmp_path):
         return sorted(scene.train.names + scene.test.names)
 
     assert names() == [name.removesuffix(".png").replace("/", "_") for name in left_right]
-    contents["frames"][1]["file_path"] = "./left/../left/00.png"  # the first frame's image again
-    path.write_text(json.dumps(contents))
-    assert len(set(names())) == 7
-    assert "images are listed twice; only the first entry counts: 00.png" in load_scene(tmp_path).notes
     for frame, name in zip(contents["frames"], ("a", "b", "c", "d", "e", "f", "g", "h")):
         (tmp_path / frame["file_path"]).with_name(f"{name}.png").write_bytes((tmp_path / "left/00.png").read_bytes())
         frame["file_path"] = str(Path(frame["file_path"]).with_name(f"{name}.png"))
@@ -287,7 +270,6 @@ def test_capture_intrinsics_per_frame_and_from_angles(tmp_path):
     ],
 )
 def test_lists_of_file_names_split_a_capture(tmp_path, lists, train, test):
-    """nerfstudio's lists of file names split a capture."""
     write_capture(tmp_path, orbit_cameras(6, radius=2, elevation=5, width=4, height=4, focal=4))
     named = {f"{name}_filenames": [f"./{index:02d}.png" for index in chosen] for name, chosen in lists.items()}
     rewrite(tmp_path, lambda contents: contents.update(named))
@@ -311,16 +293,6 @@ def test_distortion_params_are_those_of_nerfstudio(tmp_path):
     rewrite(tmp_path / "fisheye", lambda contents: contents["frames"][0].update(camera_model="OPENCV", k4=0))
     mixed = load_scene(tmp_path / "fisheye").train.cameras
     assert mixed.models.tolist() == [1, 0] and mixed.distortion[:, 5].tolist() == [pytest.approx(-0.04), 0]
-
-
-def test_capture_with_alpha_is_an_object_on_white(tmp_path):
-    original = builtin_scene(20, train_views=12, test_views=1)
-    write_capture(tmp_path, original.train.cameras, camera_angle_x=0.6911112, fl_x=None)
-    for index, image in enumerate(original.train.images):
-        Image.fromarray(image.numpy()).save(tmp_path / f"{index:02d}.png")
-    scene = load_scene(tmp_path)
-    assert (scene.background, scene.spacing) == ("white", "linear")
-    assert scene.box is not None and float(scene.box.abs().max()) < 1
 
 
 def test_normalise_poses():

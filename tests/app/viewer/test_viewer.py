@@ -102,9 +102,16 @@ def test_the_field_of_view_and_the_background_are_chosen(run, scene, tab) -> Non
     assert apart(picture, run.render(cameras, 0).colour) < 1.5
 
 
-def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> None:
+def test_a_narrow_canvas_opens_at_all_of_the_first_view_with_folded_settings(viewer, scene, tab) -> None:
     tab.rest()
+    tab.until(lambda: "GuiUplotMessage" in tab.gui)
+    assert "Settings" not in tab.gui
     with closing(Tab(viewer, scene.test.cameras, size=(39, 84), number=1)) as phone:
+        phone.until(lambda: "GuiUplotMessage" in phone.gui)
+        folder = phone.gui["Settings"]
+        assert folder["expand_by_default"] is False
+        inside = {label for label, part in phone.gui.items() if part["folder"] == folder["uuid"]}
+        assert inside >= {"Show", "Pixels", "Cells", "GuiUplotMessage"}
         phone.until(lambda: "Field of view" in phone.gui and 1 in viewer.clients)
         fov = np.degrees(viewer.clients[1].handle.camera.fov)
         across = 2 * np.degrees(np.arctan(np.tan(np.radians(fov / 2)) * 39 / 84))
@@ -115,17 +122,6 @@ def test_a_narrow_canvas_opens_at_all_of_the_first_view(viewer, scene, tab) -> N
         again.rest()  # like a browser that reconnects
         assert abs(viewer.clients[2].handle.camera.fov - 2 * np.arctan(np.tan(viewer.clients[0].fov / 2) / 2)) < 1e-3
         again.close()
-
-
-def test_a_narrow_canvas_opens_with_folded_settings(viewer, scene, tab) -> None:
-    tab.until(lambda: "GuiUplotMessage" in tab.gui)
-    assert "Settings" not in tab.gui
-    with closing(Tab(viewer, scene.test.cameras, size=(39, 84), number=1)) as phone:
-        phone.until(lambda: "GuiUplotMessage" in phone.gui)
-        folder = phone.gui["Settings"]
-        assert folder["expand_by_default"] is False
-        inside = [label for label, part in phone.gui.items() if part["folder"] == folder["uuid"]]
-        assert {"Show", "Pixels", "Cells", "GuiUplotMessage"} <= set(inside)
 
 
 def test_a_slow_page_opens_at_all_of_the_first_view(viewer, scene) -> None:

@@ -21,36 +21,29 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 AXES = torch.tensor([[1.0, 0, 0], [0.0, 0, 1], [0.0, 1, 0]])  # right, up, forward
 SPHERE = Contraction(torch.tensor([0.1, 0.0, -0.1]), 0.7)
 PERSPECTIVE = Perspective(torch.tensor([0.0, -3.0, 0.2]), AXES, 1.0, (0.8, 0.7))
+SHARED = {"share": ["features"]}
+
+
+def hash_grid(width, *, log2_entries=10, box=BOX, **options):
+    """Returns a function that makes a field."""
+    return lambda: HashGridField(width=width, log2_entries=log2_entries, box=box and tuple(map(tuple, box)), **options)
+
+
 #: The (field, router options, contraction, spacing of the strata) of each kind.
 KINDS = {
-    "hash grid": (lambda: HashGridField(width=16, log2_entries=12, box=BOX), {"share": ["features"]}, None, "linear"),
-    "a table for each cell": (
-        lambda: HashGridField(width=8, depth=2, levels=3, level_features=4, log2_entries=10, box=BOX),
-        {},
-        None,
-        "linear",
-    ),
-    "one feature a level": (
-        lambda: HashGridField(width=6, levels=5, level_features=1, log2_entries=10, finest=64, box=BOX),
-        {"share": ["features"]},
-        None,
-        "linear",
-    ),
-    "eight features a level": (
-        lambda: HashGridField(width=6, levels=2, level_features=8, log2_entries=10, view_directions=False),
-        {"share": ["features"]},
+    "hash grid": (hash_grid(16, log2_entries=12), SHARED, None, "linear"),
+    "a table for each cell": (hash_grid(8, depth=2, levels=3, level_features=4), {}, None, "linear"),
+    "one feature a level": (hash_grid(6, levels=5, level_features=1, finest=64), SHARED, None, "linear"),
+    "eight features": (
+        hash_grid(6, levels=2, level_features=8, view_directions=False, box=None),
+        SHARED,
         None,
         "linear",
     ),
     "nerf": (lambda: NeRF(width=18, depth=6, position_octaves=5), {}, None, "linear"),
     "kilonerf": (lambda: KiloNeRF(position_octaves=6), {}, None, "linear"),
     "ahead": (lambda: KiloNeRF(width=12, position_octaves=3), {}, PERSPECTIVE, "linear"),
-    "a sphere": (
-        lambda: HashGridField(width=16, log2_entries=12, box=tuple(map(tuple, SPHERE.cube.tolist()))),
-        {"share": ["features"]},
-        SPHERE,
-        "disparity",
-    ),
+    "a sphere": (hash_grid(16, log2_entries=12, box=SPHERE.cube.tolist()), SHARED, SPHERE, "disparity"),
 }
 
 
