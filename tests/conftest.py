@@ -126,13 +126,6 @@ def poisoned(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.Tensor]]:
         assert whole.all(), "a kernel wrote outside of a tensor"
 
 
-@pytest.fixture(autouse=True)
-def _same_seed() -> None:
-    torch.default_generator.manual_seed(0)  # torch.manual_seed is slower: it formats the stack per device type
-    if not NO_CUDA:
-        torch.cuda.manual_seed_all(0)
-
-
 class DeviceInPackage(TorchFunctionMode):
     """A default device, as of ``torch.set_default_device``, for the calls of functions in voronerf/ alone.
 
@@ -163,16 +156,15 @@ class DeviceInPackage(TorchFunctionMode):
 
 
 @pytest.fixture(autouse=True)
-def _device_in_package(request: pytest.FixtureRequest) -> Iterator[None]:
-    device = request.config.getoption("--device-in-package")
-    with contextlib.nullcontext() if device is None else DeviceInPackage(device):
-        yield
-
-
-@pytest.fixture(autouse=True)
-def _emulated_cuda(request: pytest.FixtureRequest) -> Iterator[None]:
-    seed = request.config.getoption("--emulate-cuda")
+def _surroundings(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Gives each test the same seed, and applies ``--device-in-package`` and ``--emulate-cuda``."""
+    torch.default_generator.manual_seed(0)  # torch.manual_seed is slower: it formats the stack per device type
+    if not NO_CUDA:
+        torch.cuda.manual_seed_all(0)
+    device, seed = map(request.config.getoption, ("--device-in-package", "--emulate-cuda"))
     with contextlib.ExitStack() as stack:
+        if device is not None:
+            stack.enter_context(DeviceInPackage(device))
         if seed is not None:
             sys.path.append(str(Path(__file__).parent / "cuda_emulation"))
             from emulated import emulated

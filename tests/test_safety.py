@@ -75,14 +75,23 @@ def test_calls_from_several_python_threads_at_once():
     assert not wrong
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="forks")
-def test_a_forked_child_runs_on_one_thread():
-    """A forked child works on one thread after its parent used several; with more it would wait for parent threads."""
+@pytest.mark.skipif(sys.platform != "linux", reason="forks, and counts threads in /proc")
+def test_threads_of_a_process_and_of_its_forked_child():
+    """Kernels start exactly the threads of `set_num_threads`.
+
+    A forked child works on one thread after its parent used several; with more it would wait for parent threads.
+    """
     code = """
 import os, torch, voronerf
-torch.set_num_threads(2)
-points, centres = torch.rand(20000, 3), torch.rand(16, 3)
+torch.set_num_threads(1)
+points, centres = torch.rand(50000, 3), torch.rand(16, 3)
+before = len(os.listdir("/proc/self/task"))
 expected = voronerf.nearest_centre(points, centres)
+voronerf.cell_sort(expected, 16)
+assert len(os.listdir("/proc/self/task")) == before
+torch.set_num_threads(3)
+voronerf.nearest_centre(points, centres)
+assert len(os.listdir("/proc/self/task")) == before + 2
 child = os.fork()
 if child == 0:
     torch.set_num_threads(1)
@@ -91,24 +100,6 @@ if child == 0:
     out = voronerf.grouped_linear(points[order.long()], offsets, torch.rand(16, 8, 3))
     os._exit(0 if torch.equal(cells, expected) and out.isfinite().all() else 1)
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-"""
-    python("-c", code)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
-def test_set_num_threads_is_honoured():
-    """Kernels start exactly the threads of `set_num_threads`, counted in the process."""
-    code = """
-import os, torch, voronerf
-torch.set_num_threads(1)
-points, centres = torch.rand(50000, 3), torch.rand(16, 3)
-before = len(os.listdir("/proc/self/task"))
-voronerf.nearest_centre(points, centres)
-voronerf.cell_sort(voronerf.nearest_centre(points, centres), 16)
-assert len(os.listdir("/proc/self/task")) == before
-torch.set_num_threads(3)
-voronerf.nearest_centre(points, centres)
-assert len(os.listdir("/proc/self/task")) == before + 2
 """
     python("-c", code)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from dataclasses import replace
 
 import pytest
@@ -64,7 +65,8 @@ def test_an_opened_run_needs_its_files_no_longer(folder, scene, tmp_path) -> Non
     assert torch.equal(run.render(0).colour, expected.colour)
 
 
-def test_how_a_run_is_rendered_may_differ(folder, scene) -> None:
+def test_how_a_run_is_rendered_may_differ(folder, scene, monkeypatch) -> None:
+    monkeypatch.setattr(sys.modules["voronerf.app.train.build"], "PICTURE_RESOLUTION", 24)  # to save time
     other = open_run(folder, scene=scene, samples=(5,), occupancy=True, backend="reference")
     assert other.renderer.sampler.samples == 5
     assert {other.renderer.backend, other.router.backend} == {"reference"}

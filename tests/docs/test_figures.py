@@ -78,10 +78,7 @@ def test_a_page_or_a_script_names_every_file() -> None:
 
 @pytest.mark.parametrize(
     ("page", "arguments"),
-    [
-        ("performance", "throughput.json"),
-        ("foreign-fields", "foreign_fields.json --foreign"),
-    ],
+    [("performance", "throughput.json"), ("foreign-fields", "foreign_fields.json --foreign")],
 )
 def test_tables_of_operations_are_those_of_the_program(page: str, arguments: str) -> None:
     name, *options = arguments.split()

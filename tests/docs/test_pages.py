@@ -67,14 +67,6 @@ def test_every_option_is_on_the_page() -> None:
     assert "--frames" in options()["render"]
 
 
-@pytest.mark.parametrize("name", [name for name in PAGES if "changelog" not in name])
-def test_options_on_a_page_exist(name: str) -> None:
-    for command, line in re.findall(r"voronerf ([\w-]+)( [^`\n|#]*)", (ROOT / name).read_text()):
-        command_options = options().get(command, set())
-        for option in re.findall(r"(?<!\w)--[a-z-]+", line) if command_options else ():
-            assert option in command_options, f"{name}: voronerf {command} has no {option}"
-
-
 @functools.cache
 def sources() -> set[str]:
     names = ("voronerf", "csrc", "kernels", "benchmarks", "tests", "docs", "examples", ".ci")

@@ -148,12 +148,8 @@ def test_solids_move_with_their_frames(torch_seed) -> None:
 
 def test_cells_that_are_cut_away_show_nothing_and_leave_the_others(torch_seed) -> None:
     router, inputs = hashed(6), queries(width=1.0)
-    part = part_of(router).keep(torch.tensor([1, 4]))
-    assert (
-        part.num_cells == 2
-        and part.network.router.num_cells == 2
-        and part_of(router).keep(torch.tensor([], dtype=torch.int64)) is None
-    )
+    part, nothing = (part_of(router).keep(torch.tensor(cells, dtype=torch.int64)) for cells in ([1, 4], []))
+    assert part.num_cells == part.network.router.num_cells == 2 and nothing is None
     colour, density = Parts([part]).eval()(*inputs)
     cells, wanted = router.assign(inputs[0]), router(*inputs)
     kept = (cells == 1) | (cells == 4)

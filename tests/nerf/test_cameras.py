@@ -29,14 +29,6 @@ def test_axes_are_opengl():
     assert torch.equal(middle.origins, torch.zeros(3, 3))
 
 
-def test_integers_name_pixel_centres():
-    some = cameras()
-    index = torch.tensor([0, 2])
-    whole = some.rays(index, torch.tensor([3, 29]), torch.tensor([0, 19]))
-    centre = some.rays(index, torch.tensor([3.5, 29.5]), torch.tensor([0.5, 19.5]))
-    assert torch.equal(whole.directions, centre.directions)
-
-
 @pytest.mark.parametrize("distortion", [None, FOX, STRONG])
 def test_image_rays_are_row_major_unit_and_agree_with_rays(distortion):
     some = cameras(distortion=distortion)

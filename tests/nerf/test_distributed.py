@@ -1,5 +1,7 @@
-"""Tests of data-parallel training: two or three processes of this machine, started by ``torchrun``."""
+"""Tests of data-parallel training: two or three processes of this machine."""
 
+import os
+import socket
 import sys
 
 import pytest
@@ -10,14 +12,19 @@ needs_gloo = pytest.mark.skipif(
     not (torch.distributed.is_available() and torch.distributed.is_gloo_available()), reason="needs gloo"
 )
 
-#: The collectives, with tensors that differ in each process, checked against the tensors of all processes.
+#: The collectives, with tensors that differ in each process, checked against the tensors of all processes. The first
+#: process loads torch once for all.
 COLLECTIVES = """
-import sys
+import gc, os, sys
 import torch
 from voronerf import OccupancyGrid
 from voronerf.nerf import Ranks
 
+gc.freeze()  # otherwise each process collects the garbage of torch at its end
+rank = next((rank for rank in (1, 2) if not os.fork()), 0)
+os.environ["RANK"] = str(rank)
 ranks = Ranks.join()
+assert (ranks.rank, ranks.size) == (rank, 3)
 drawn = [
     [torch.randn(shape, generator=torch.Generator().manual_seed(rank)) for shape in ((), (3, 4), (40_000, 2))]
     for rank in range(ranks.size)
@@ -47,6 +54,7 @@ assert grid.occupied.flatten().tolist() == [True, False, False]
 sys.setswitchinterval(1000)  # Python ends before another thread can free the last tensors
 for _ in range(20):
     ranks.maximum(torch.ones(2))
+assert rank or [os.wait()[1] for _ in (1, 2)] == [0, 0]
 """
 
 #: A training with a split, updates of the grid and a learning start, which prints a checksum of its networks.
@@ -72,23 +80,21 @@ assert "replayed" in explained and "in Python: average" in explained, explained
 """
 
 
-def in_processes(count, code, folder):
-    script = folder / "script.py"
-    script.write_text(code)
-    return python("-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}", script)
-
-
 @needs_gloo
-@pytest.mark.skipif(sys.platform == "win32", reason="torchrun needs libuv on Windows")
-def test_collectives_give_the_numbers_of_all_processes(tmp_path):
-    in_processes(3, COLLECTIVES, tmp_path)
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_collectives_give_the_numbers_of_all_processes():
+    with socket.create_server(("localhost", 0)) as free:
+        port = str(free.getsockname()[1])
+    python("-c", COLLECTIVES, env={**os.environ, "WORLD_SIZE": "3", "MASTER_ADDR": "localhost", "MASTER_PORT": port})
 
 
 @pytest.mark.slow
 @needs_gloo
 @pytest.mark.skipif(sys.platform == "win32", reason="torchrun needs libuv on Windows")
 def test_processes_hold_equal_networks_and_draw_other_rays(tmp_path):
-    lines = [line.split() for line in in_processes(2, TRAINING, tmp_path).splitlines()]
+    (script := tmp_path / "script.py").write_text(TRAINING)
+    said = python("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", script)
+    lines = [line.split() for line in said.splitlines()]
     results = {tuple(words[2:]) for words in lines if words[0] == "rank"}
     assert len(results) == 1 and next(iter(results))[0] == "4", lines
     assert len({words[2] for words in lines if words[0] == "rays"}) == 2, lines

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import refuses
 
 from voronerf import HashGridField, VoronoiRouter
-from voronerf.app.scenes import SceneError, builtin_scene, load_scene
+from voronerf.app.scenes import SceneError, builtin_scene
 from voronerf.app.train.build import check_memory, make_routers
 from voronerf.app.train.config import ConfigError, TrainConfig
 from voronerf.app.train.defaults import resolve
@@ -61,15 +63,14 @@ def test_shared_layers_of_a_table():
 
 
 def test_settings_come_from_the_scene():
-    scene = load_scene("builtin", downscale=5)
+    scene, larger = (builtin_scene(side, train_views=2, test_views=1) for side in (20, 50))
     config = resolve(TrainConfig(field="hashgrid", field_options=("log2_entries=11", "levels=6")), scene)
     field = make_routers(config)["field"].module
     assert field.layers.grid.log2_entries == 11 and field.features.dim() == 2
     low, high = torch.tensor(field.layers.grid.box)
     torch.testing.assert_close((low + high) / 2, scene.box.mean(0))
     torch.testing.assert_close(high - low, (scene.box[1] - scene.box[0]).amax().expand(3))
-    finer = resolve(TrainConfig(field="hashgrid"), load_scene("builtin", downscale=2))
-    fine = make_routers(finer)["field"].module.layers.grid.finest
+    fine = make_routers(resolve(TrainConfig(field="hashgrid"), larger))["field"].module.layers.grid.finest
     assert 2.4 < fine / field.layers.grid.finest < 2.6
     assert resolve(config, scene) == config
     kept = resolve(TrainConfig(field="hashgrid", field_options=("finest=99",)), scene)
@@ -104,8 +105,7 @@ def test_bad_settings():
     with pytest.raises(ConfigError, match=r"--field nerf of --width 4096 with 10000 cells needs .* GiB of"):
         check_memory(TrainConfig(field="nerf", cells=(10_000,), width=4096, depth=9))
     refuses("HashGridField: directions must be given", HashGridField(log2_entries=10), torch.rand(2, 3))
-    capture = load_scene("builtin", downscale=10)
-    object.__setattr__(capture, "box", None)
+    capture = replace(builtin_scene(10, train_views=2, test_views=1), box=None)
     with pytest.raises(SceneError, match="builtin: has no box, a field that covers space needs contraction sphere or"):
         resolve(TrainConfig(contraction="none"), capture)
 

@@ -20,7 +20,6 @@ from voronerf.nerf import (
     RayLoss,
     Rays,
     Renderer,
-    SparseDepth,
     Stratified,
     TrainingStep,
     intersect_box,
@@ -180,18 +179,10 @@ def test_a_grid_waits_for_a_field_with_a_low_learning_rate():
     "field", [HashGridField(width=8, log2_entries=10), NeRF(width=8, depth=2), NeRF(width=8, view_directions=False)]
 )
 def test_the_density_of_a_router_is_found_without_its_colour(field):
-    for parameter in field.parameters():
-        torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(1))
     router = VoronoiRouter(field, torch.rand(5, 3), share=[n for n, _ in field.named_parameters() if n == "features"])
-    box = torch.tensor([[0.0, 0, 0], [1.0, 1, 1]])
     networks = radiance_of(router).networks
     every, alone = (sum(step.op == "linear" for step in part.steps) for part in (networks.program, networks.density))
     assert alone < every and not networks.density.rays
-    grids = [OccupancyGrid(box, 6, threshold=1e-6) for _ in range(2)]
-    for grid, asked in zip(grids, (router, lambda *arguments: router(*arguments))):
-        grid.update(asked, generator=torch.Generator().manual_seed(2))
-    torch.testing.assert_close(grids[0].density, grids[1].density)
-    assert len(grids[0].density.unique()) > 10
 
 
 def test_points_lie_in_their_cells():
@@ -512,44 +503,6 @@ def test_pictures_have_samples_of_their_own():
     assert not torch.equal(pictures[0].colour, pictures[2].colour)
 
 
-def ends(rays):
-    return torch.ones(len(rays)), torch.full((len(rays),), 5.0)
-
-
-@pytest.mark.parametrize(
-    ("full_gradient", "sparse_depth", "robust"), [(None, 0, 0.0), (4.0, 0, 0.05), (None, 0.1, 0.05), (4.0, 0.1, 0.0)]
-)
-@pytest.mark.parametrize("field", [NeRF(width=16, depth=2), HashGridField(width=16, levels=2, log2_entries=10)])
-def test_a_comparison_is_the_rendering_and_its_loss(field, full_gradient, sparse_depth, robust):
-    """The loss and its gradients equal the results for the same field without a layer table.
-
-    Some cases have the sparse-depth term of the batch's last rays, which end in front of, inside and behind the grid.
-    """
-    grid = tight_grid()
-    router = VoronoiRouter(field, torch.rand(4, 3) - 0.5, **getattr(field, "router_options", {}))
-    rays = cameras().image_rays(0)
-    target, background = torch.rand(len(rays), 3), torch.rand(len(rays), 3)
-    options = {"samples": 24, "occupancy": grid, "full_gradient": full_gradient}
-    renderer = renderer_of({"field": router}, **options)
-
-    seen = torch.linspace(1.5, 4.5, 200) if sparse_depth else None
-
-    def compare(renderer):
-        batch = Batch(rays, *ends(rays), target, background, seen)
-        loss = RayLoss(renderer, terms=[SparseDepth(sparse_depth)], robust=robust)
-        results = loss(batch, torch.Generator().manual_seed(3))
-        return results, torch.autograd.grad(results.loss, list(router.parameters()))
-
-    results, gradients = compare(renderer)
-    plain = renderer_of({"field": lambda *arguments: router(*arguments)}, **options)  # a field without a layer table
-    expected, same = compare(plain)
-    assert len(results.weights) > 0 and torch.equal(results.samples.positions, expected.samples.positions)
-    for part, other in zip(
-        (*results[:4], results.importance(), *gradients), (*expected[:4], expected.importance(), *same)
-    ):
-        torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-6)
-
-
 def test_samples_that_no_light_reaches_have_no_gradient():
     """Samples behind a solid surface have no gradient; the gradient of the other samples is right to a thousandth."""
     field = HashGridField(width=16, levels=2, log2_entries=10)
@@ -558,7 +511,7 @@ def test_samples_that_no_light_reaches_have_no_gradient():
     rays, gradients = cameras().image_rays(0), []
     for of in (router, lambda *arguments: router(*arguments)):  # the second field has no layer table
         renderer = renderer_of({"field": of}, samples=96, occupancy=tight_grid())
-        batch = Batch(rays, *ends(rays), torch.zeros(len(rays), 3))
+        batch = Batch(rays, torch.ones(len(rays)), torch.full((len(rays),), 5.0), torch.zeros(len(rays), 3))
         result = RayLoss(renderer)(batch, torch.Generator().manual_seed(3))
         gradients.append(torch.autograd.grad(result.loss, router.module.features)[0])
     some, every = gradients

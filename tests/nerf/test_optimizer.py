@@ -43,21 +43,6 @@ def test_options_that_are_not_there_are_refused(option):
     assert bool((weight < 1).all())
 
 
-def test_tables_move_where_they_have_a_gradient_and_keep_it():
-    table, other = torch.nn.Parameter(torch.ones(6, 2)), torch.nn.Parameter(torch.ones(2))
-    optimizer = Adam([{"params": [other]}, {"params": [table], "sparse": True}], lr=0.5)
-    for row in (1, 4):
-        optimizer.zero_grad()
-        (table[row].sum() + other.sum()).backward()
-        before, moments = table.detach().clone(), optimizer.state[table].get("exp_avg", torch.zeros(6, 2)).clone()
-        optimizer.step()
-        rest = torch.arange(6) != row
-        assert torch.equal(table[rest], before[rest]) and bool((table[row] < before[row]).all())
-        assert torch.equal(optimizer.state[table]["exp_avg"][rest], moments[rest])
-        assert table.grad is not None and bool((table.grad[row] == 1).all())
-    assert float(optimizer.state[table]["step"]) == 2 and bool((other < 1).all())
-
-
 def test_cells_without_samples_keep_their_bits():
     """Cells with samples take the first step of ``torch.optim.Adam``; other cells keep parameters and moments."""
     generator, options = torch.Generator().manual_seed(0), {"lr": 0.01, "betas": (0.9, 0.999), "eps": 1e-8}

@@ -124,14 +124,10 @@ def test_losses():
 def test_jittered_edges_cover_the_ray(spacing, samples):
     near, far = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([4.0, 2.0, 30.0])
     even = stratified_edges(near, far, samples, jitter=False, spacing=spacing)
-    for seed in range(5):
-        generator = seeded(seed)
-        edges = stratified_edges(near, far, samples, jitter=True, spacing=spacing, generator=generator)
-        assert edges.shape == even.shape == (3, samples + 1)
-        assert torch.equal(edges[:, 0], near) and torch.equal(edges[:, -1], far)
-        assert (edges.diff(dim=1) >= 0).all()
-        if samples > 1:
-            assert not torch.equal(edges, even)
+    edges = stratified_edges(near, far, samples, jitter=True, spacing=spacing, generator=seeded(0))
+    assert edges.shape == even.shape == (3, samples + 1)
+    assert torch.equal(edges[:, 0], near) and torch.equal(edges[:, -1], far)
+    assert (edges.diff(dim=1) >= 0).all() and torch.equal(edges, even) == (samples == 1)
 
 
 def test_training_draws_differ_and_pictures_do_not():

@@ -24,20 +24,8 @@ from voronerf.nerf.samplers import SETTLING_STEPS
 from voronerf.nerf.schedule import GROUP
 
 SEEDS_MEMORY_VIEWS = {
-    *(
-        "randint",
-        "empty",
-        "new_empty",
-        "new_zeros",
-        "view",
-        "unsqueeze",
-        "expand",
-        "select",
-        "slice",
-        "detach",
-        "alias",
-    ),
-    *("split_with_sizes", "promote_types", "_local_scalar_dense"),
+    *("randint", "empty", "new_empty", "new_zeros", "view", "unsqueeze", "expand", "select", "slice", "detach"),
+    *("alias", "split_with_sizes", "promote_types", "_local_scalar_dense"),
 }
 
 

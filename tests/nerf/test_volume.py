@@ -181,15 +181,6 @@ def test_rays_that_miss_the_box_do_not_ask_the_field():
     assert float(nothing.colour.abs().max()) == 0 and float(nothing.depth.min()) == 5.0
 
 
-def test_a_picture_has_no_gradient():
-    weight = torch.ones(3, requires_grad=True)
-
-    def learned(positions, directions, ray_index):
-        return positions * 0 + weight, positions[:, 0] * 0 + 1
-
-    assert not render_image(learned, cameras(), 0, near=1.0, far=5.0, samples=2).colour.requires_grad
-
-
 def test_no_rays():
     result = render_rays(ball, Rays(torch.zeros(0, 3), torch.zeros(0, 3)), 1.0, 2.0, samples=3)
     assert result.colour.shape == (0, 3) and result.weights.shape == (0,)

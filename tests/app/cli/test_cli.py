@@ -34,27 +34,15 @@ def succeeds(*parts):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "tiny"
-    succeeds("train --data builtin --out", out, TINY)
-    return out
+def run(tmp_path_factory, tiny_run):
+    return shutil.copytree(tiny_run, tmp_path_factory.mktemp("runs") / "tiny")
 
 
 def test_train_writes_the_run_directory(run):
-    names = {str(p.relative_to(run)) for p in run.rglob("*") if p.is_file()}
-    assert {"config.json", "metrics.jsonl", "summary.json", "checkpoints/last.safetensors", "plots/psnr.png"} <= names
+    assert (run / "checkpoints/last.safetensors").is_file() and (run / "plots/psnr.png").is_file()
     (panel,) = (run / "images").glob("*.png")
     width, height = Image.open(panel).size
     assert width >= 5 * 16 and height >= 16
-    summary = read_json(run / "summary.json")
-    assert {"psnr", "ssim", "seconds", "steps", "rays_per_second", "parameters", "stages"} <= summary.keys()
-
-
-def test_a_training_prints_nothing_about_absent_lpips(tmp_path, capsys, fails):
-    succeeds("train --data builtin --out", tmp_path / "run", TINY)
-    assert "lpips" not in capsys.readouterr().out.lower()
-    assert read_json(tmp_path / "run" / "summary.json")["lpips"] is None
-    fails("nowhere: there is no such file", "train --data builtin --lpips nowhere --out", tmp_path / "other", TINY)
 
 
 def test_eval_scores_every_view(run, capsys, fails):
@@ -123,14 +111,14 @@ def test_videos_along_a_path(run, tmp_path, fails):
     fails("flight.json: is not a camera path", "render", run, "--path", file)
 
 
-def test_settings_of_a_file(run, tmp_path, fails):
+def test_settings_of_a_file(run, tmp_path, capsys, fails):
     again = tmp_path / "again"
     succeeds("train --config", run / "config.json", "--seed 3 --out", again)
+    assert "lpips" not in capsys.readouterr().out.lower() and read_json(again / "summary.json")["lpips"] is None
     first, second = (json.loads((folder / "config.json").read_text()) for folder in (run, again))
     assert {name for name in first if first[name] != second[name]} == {"seed", "out"}
     fails("there is no such file", "train --config", tmp_path / "none.json")
-    (tmp_path / "bad.json").write_text('{"cels": [3]}')
-    fails("not a configuration of this version", "train --config", tmp_path / "bad.json")
+    fails("nowhere: there is no such file", "train --data builtin --lpips nowhere --out", tmp_path / "other", TINY)
     fails("--config must be left out with --resume", "train --resume --config", run / "config.json", "--out", run)
 
 
@@ -168,10 +156,9 @@ def test_info_names_every_backend(capsys):
 def test_resume_needs_no_setting_again(run, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
-    # The run is extended twice, then changed from a number of steps to a time budget, and back.
+    # The run is extended, then changed from a number of steps to a time budget, and back.
     for options, steps, budget in (
         (f"--out {copy} --steps 20", 20, None),
-        (f"--out={copy} --steps 22", 22, None),
         (f"--out={copy} --budget=0.001", None, 0.001),
         (f"--out={copy} --steps 24", 24, None),
     ):
@@ -185,13 +172,13 @@ def test_defaults_follow_the_speed_of_the_machine_that_began(tmp_path, monkeypat
     """Defaults stay the same when a machine of another speed resumes the run."""
     out, tiny = tmp_path / "run", TINY.replace("--steps 16", "").replace("--samples 8", "").replace("--depth 2", "")
     monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1024.0)
-    succeeds("train --data builtin --budget 0.2 --out", out, tiny)
+    succeeds("train --data builtin --budget 0.02 --out", out, tiny)
     begun = read_json(out / "config.json")
     assert begun["samples"] == [96]
     monkeypatch.setattr("voronerf.app.cli.train.machine_speed", lambda: 1.0)
-    succeeds("train --resume --budget 0.3 --out", out)
-    assert read_json(out / "config.json") == begun | {"budget": 0.3}
-    succeeds("train --data builtin --budget 0.2 --out", tmp_path / "slow", tiny)
+    succeeds("train --resume --budget 0.03 --out", out)
+    assert read_json(out / "config.json") == begun | {"budget": 0.03}
+    succeeds("train --data builtin --budget 0.02 --out", tmp_path / "slow", tiny)
     assert read_json(tmp_path / "slow" / "config.json")["samples"] == [48]
 
 
@@ -269,19 +256,11 @@ def test_an_interrupted_demo_says_where_its_run_is(tmp_path, capsys, monkeypatch
 
     monkeypatch.setattr("voronerf.app.cli.demo.SIZE", 16)
     monkeypatch.setattr("voronerf.app.cli.demo.show", interrupt)
-    assert main(words("demo --budget 0.1 --out", tmp_path / "run")) == status
+    assert main(words("demo --budget 0.02 --out", tmp_path / "run")) == status
     said = capsys.readouterr()
     assert said.err == "" and "psnr" in said.out  # training lines, since stdout is no terminal
     (command,) = re.findall("stopped; the trained run is in .*: voronerf (.*) makes a video of it\n$", said.out)
-    assert main([*shlex.split(command), "--frames", "1"]) == 0 and (tmp_path / "run" / "video.mp4").is_file()
-
-
-def test_help_has_units(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["train", "--help"])
-    output = capsys.readouterr().out
-    flags = "data downscale budget steps out seed field width cells split-at backend device"
-    assert stop.value.code == 0 and "seconds" in output and all(f"--{flag}" in output for flag in words(flags))
+    assert shlex.split(command) == ["render", str(tmp_path / "run")]
 
 
 def test_bad_input_is_one_line(run, tmp_path, fails):
@@ -290,7 +269,6 @@ def test_bad_input_is_one_line(run, tmp_path, fails):
     fails("there is no such folder", "train --data", tmp_path / "none", *small)
     fails("is not a scene", "train --data", tmp_path, *small)
     fails("--cells must lie in 2..10000 on every level", "train --cells 0", *small)
-    fails("--device must be auto, cpu or a GPU that is present, got 'gpu'", "train --device gpu", *small)
     fails("must not hold a run already", "train --downscale 20 --out", run)
     fails(f"no run at {out}: there is nothing to resume", "train --resume", *small)
     fails("--resume needs --out", "train --resume")

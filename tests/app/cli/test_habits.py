@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -45,17 +46,10 @@ def test_runs_are_compared(tmp_path, capsys):
 
 def test_numbers_are_compared_as_people_write_them(tmp_path, capsys):
     short, long = make_run(tmp_path / "short", 30.125, [16]), make_run(tmp_path / "long", 27.5, [4, 4])
-    given = {
-        short: (
-            {"seconds": 4.6075, "steps": 1234},
-            {"lr": 1e-5, "budget": None, "field_options": ["finest=42", "x=1"]},
-        ),
-        long: (
-            {"seconds": 479.8, "steps": 99},
-            {"lr": 0.1 + 0.2, "budget": 1e6, "field_options": ["finest=107", "x=1"]},
-        ),
-    }
-    for run, changes in given.items():
+    summaries = {"seconds": 4.6075, "steps": 1234}, {"seconds": 479.8, "steps": 99}
+    one = {"lr": 1e-5, "budget": None, "field_options": ["finest=42", "x=1"]}
+    other = {"lr": 0.1 + 0.2, "budget": 1e6, "field_options": ["finest=107", "x=1"]}
+    for run, *changes in zip((short, long), summaries, (one, other)):
         for name, change in zip(("summary.json", "config.json"), changes):
             (run / name).write_text(json.dumps(json.loads((run / name).read_text()) | change))
     assert main(words("compare", short, long)) == 0
@@ -86,9 +80,8 @@ def test_scores_of_parts_of_views_are_marked(tmp_path, capsys):
     assert read_curve(short) == [(1, 20.0)]
 
 
-def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
-    one, joined = tmp_path / "one", tmp_path / "two runs"
-    assert main(words("train --data builtin --out", one, TINY)) == 0
+def test_a_joined_run_shows_what_is_known(tmp_path, tiny_run, capsys):
+    one, joined = tiny_run, tmp_path / "two runs"
     assert main(words("join", one, one, "--out", joined)) == 0
     capsys.readouterr()
 
@@ -110,9 +103,8 @@ def test_a_joined_run_shows_what_is_known(tmp_path, capsys):
     assert figures["PSNR [dB]"][1] == f"{psnr:.2f}" and figures["scores of"][1] == "3 views" and "makes" not in shown
 
 
-def test_cut_runs_placed_runs_and_panoramas(tmp_path, capsys, fails):
-    one, part, placed = tmp_path / "one", tmp_path / "part", tmp_path / "placed"
-    assert main(words("train --data builtin --out", one, TINY)) == 0
+def test_cut_runs_placed_runs_and_panoramas(tmp_path, tiny_run, capsys, fails):
+    one, part, placed = shutil.copytree(tiny_run, tmp_path / "one"), tmp_path / "part", tmp_path / "placed"
     assert main(words("cut", one, "--out", part, "--sphere 0 0 0 0.4")) == 0
     assert main(words("place", one, part, "--out", placed, "--at 0 0 1")) == 0
     for run, is_cut in ((one, False), (part, True), (placed, False)):

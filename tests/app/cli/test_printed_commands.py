@@ -34,11 +34,7 @@ PROGRAMS = ("voronerf", "python", "make", "pip", "ns-train", "tensorboard")
 FOREIGN = ("tensorboard", "ns-train")
 #: Option values that make a command quick.
 SHORT = {"--budget": "0.1", "--frames": "2", "--resolution": "8", "--count": "5"}
-ADDED = {
-    "train": ("--budget",),
-    "render": ("--frames",),
-    "export": ("--resolution", "--count"),
-}
+ADDED = {"train": ("--budget",), "render": ("--frames",), "export": ("--resolution", "--count")}
 #: Replacements for placeholders and for large scenes.
 STAND_INS = {
     "DIR": "scene",

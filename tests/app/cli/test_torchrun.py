@@ -138,6 +138,7 @@ def test_regions_are_trained_and_joined(tmp_path, capsys):
         ("regions builtin-city --count 41", "count must be 1 to 40, the number of points, got 41"),
     ],
 )
-def test_bad_regions_are_one_line(tmp_path, parts, message, fails):
+def test_bad_regions_are_one_line(tmp_path, parts, message, fails, monkeypatch):
+    monkeypatch.setattr("voronerf.app.cli.regions.load_scene", lambda data: load_scene(data, downscale=10))
     scene = "--data builtin-city --downscale 10 --steps 8" if parts.startswith("train") else ""
     fails(message, parts, scene, "--out", tmp_path / "out")

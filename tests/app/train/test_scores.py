@@ -1,5 +1,6 @@
 """Tests of evaluations during training: the time they take, warnings about poor scores, and invalid steps."""
 
+import functools
 import json
 import math
 import re
@@ -48,17 +49,22 @@ class Clock:
 SIDE = 96
 
 
+@functools.cache
+def eight_views():
+    return builtin_scene(SIDE, train_views=2, test_views=8)
+
+
 def scored(monkeypatch, view_seconds, **settings):
     """Returns (state, scores, clock) of a training with a budget of 40 s and steps of 1 s."""
     clock = Clock(monkeypatch, view_seconds)
     settings = {"steps": None, "budget": 40.0, "eval_views": None, "evaluations": 4, **settings}
-    state = build(small(**settings), builtin_scene(SIDE, train_views=2, test_views=8))
+    state = build(small(**settings), eight_views())
     scores = Scores(None, clock=lambda: clock.now)
     run(state, [scores], clock=clock)
     return state, scores, clock
 
 
-@pytest.mark.parametrize("seconds", [0.001, 0.1, 0.3, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 1.0, 3.0, 20.0])
 def test_evaluations_take_a_tenth_of_the_budget(monkeypatch, seconds):
     """If views are slow, fewer views are scored, or views only at the end, or only the middle of one view."""
     state, scores, clock = scored(monkeypatch, lambda now: seconds)
@@ -110,8 +116,8 @@ def test_as_many_panels_are_drawn_as_a_tenth_of_the_budget_allows(monkeypatch):
 
 
 def test_evaluations_of_a_number_of_steps_do_not_depend_on_time(monkeypatch):
-    _, scores, _ = scored(monkeypatch, lambda now: 20.0, steps=40, budget=None)
-    assert [(line["step"], line["views"]) for line in scores.metrics] == [(10, 8), (20, 8), (30, 8), (40, 8)]
+    _, scores, _ = scored(monkeypatch, lambda now: 20.0, steps=20, budget=None, evaluations=2)
+    assert [(line["step"], line["views"]) for line in scores.metrics] == [(10, 8), (20, 8)]
 
 
 def test_a_stop_in_the_last_step_leaves_nothing_out(tmp_path, scene):
@@ -140,8 +146,7 @@ def test_infinite_scores_are_null_in_files(tmp_path, scene, monkeypatch):
         refuses(f"metrics.jsonl: line 1: {message}", trained, config, scene, resume=True)
 
 
-@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e19])
-@pytest.mark.parametrize("field", ["nerf", "hashgrid"])
+@pytest.mark.parametrize(("field", "value"), [("nerf", math.inf), ("hashgrid", math.nan), ("hashgrid", 1e19)])
 def test_a_step_with_such_a_gradient_is_skipped_and_counted(scene, field, value):
     state = started(scene, 1, field=field, depth=1, cells=())
     bias = next(p for name, p in state.router.named_parameters() if name.endswith("bias"))

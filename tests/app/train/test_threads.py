@@ -15,9 +15,8 @@ VARIANTS = {
     "hierarchical": {"sampling": "hierarchical", "samples": (67, 6)},
     "cones": {"field": "mipnerf", "contraction": "sphere", "sampling": "hierarchical", "samples": (67, 6)},
     "half": {"precision": "bf16", "assignment": "stochastic"},
-    "hash grid": HASH | {"average": 0.9},
     "hash grid in a sphere": HASH | {"contraction": "sphere"},
-    "hash grid with occupancy": HASH | {"occupancy": True},
+    "hash grid with occupancy": HASH | {"occupancy": True, "average": 0.9},
 }
 
 
