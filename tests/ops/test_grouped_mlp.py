@@ -280,6 +280,7 @@ def test_errors():
     good = {**case.arguments(case.inputs), "biases": [None] * 7, "offsets": case.offsets}
     directions, weights, refuses = case.inputs[1], good["weights"], refusals(grouped_mlp, **good)
     refuses("offsets must have at least two entries, got [1]", offsets=case.offsets[:1])
+    refuses("positions must have shape [n, p], got [5]", positions=case.inputs[0][:, 0])
     refuses("directions must be given for layers that read them, got None", directions=None, direction_index=None)
     harmonics = MLP((Layer((DIRECTIONS,), 4),), (0,), direction_encoding="spherical", direction_degree=2)
     two = directions[:, :2]

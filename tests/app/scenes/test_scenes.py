@@ -37,6 +37,19 @@ def test_blender_round_trip(tmp_path):
     torch.testing.assert_close(half.train.truth(0, white), averaged, atol=1.01 / 255, rtol=0)
 
 
+def test_names_of_blender_are_all_different(tmp_path):
+    write_blender(tmp_path, builtin_scene(8, train_views=4, test_views=1), 0.69)
+
+    def move(contents):
+        for index, frame in enumerate(contents["frames"]):
+            (folder := tmp_path / f"cam{index % 2}").mkdir(exist_ok=True)
+            (tmp_path / f"{frame['file_path']}.png").rename(folder / f"{index // 2}.png")
+            frame["file_path"] = f".\\cam{index % 2}\\{index // 2}"
+
+    rewrite(tmp_path, move, "transforms_train")
+    assert load_scene(tmp_path).train.names == ("cam0_0", "cam1_0", "cam0_1", "cam1_1")
+
+
 def test_blender_without_alpha_has_no_box(tmp_path):
     original = builtin_scene(12, train_views=5, test_views=1)
     write_blender(tmp_path, original, 0.69)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import read_json, refuses, same, trained
-from tiny_runs import HIERARCHICAL, Each, assert_resumes, scores, small, tensors
+from tiny_runs import HIERARCHICAL, Each, assert_resumes, scores, small, steps_of, tensors
 
 import voronerf.app.evaluate.scores as scores_module
 from voronerf.app import open_run
@@ -152,6 +152,15 @@ def test_steps_that_were_left_out_are_counted_on(scene, stopped):
     load(state := build(stopped, scene), checkpoint)
     state.training_step.guard.skipped.add_(1)
     assert state.skipped == snapshot(state).values["skipped"] == 4
+
+
+def test_a_training_leaves_its_checkpoint_as_it_was(scene, stopped):
+    """Several trainings may start from one checkpoint; an optimiser updates its moments in place."""
+    checkpoint = load_checkpoint(checkpoint_path(stopped.out))
+    before = {name: tensor.clone() for name, tensor in checkpoint.tensors.items()}
+    load(state := build(stopped, scene), checkpoint)
+    steps_of(state, 2)
+    assert same(before, checkpoint.tensors)
 
 
 def test_a_run_goes_on_from_an_older_checkpoint(tmp_path, scene):
