@@ -201,10 +201,10 @@ def test_a_file_of_tests_that_hangs_fails_alone(parts, tmp_path, capsys):
     for name, body in bodies.items():
         files.append(tmp_path / f"test_planted_{name}.py")
         files[-1].write_text(body)
-    assert parts.tests(tmp_path / "out", files, 5.0) == 2
+    assert parts.tests(tmp_path / "out", files, 10.0) == 2
     said = capsys.readouterr().out.splitlines()
     outcomes = {line.split()[1].removeprefix("test_planted_"): line for line in said if "  test_planted_" in line}
-    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 5 s")
+    assert outcomes["hangs.py:"].startswith("FAILED  test_planted_hangs.py: stopped after 10 s")
     assert list(outcomes)[-1] == "hangs.py:", "the others are told before it"
     assert outcomes["passes.py:"].startswith("passed") and "1 passed" in outcomes["passes.py:"]
     assert outcomes["wrong.py:"].startswith("FAILED") and outcomes["other.py:"].startswith("passed")
