@@ -287,30 +287,36 @@ def test_floaters_are_dropped_at_the_end_of_a_long_training_with_many_views(monk
     assert dropped[0].shape == (128, 128, 128) and 0 <= int(dropped[0].max()) <= 4
 
 
-def test_long_trainings_in_contracted_space_have_a_lower_rate_and_more_rays(scene):
-    """Twice `LONG_STEPS` steps halve the rate, but not the decay; with a budget, a step has four times as many rays."""
+def test_long_trainings_have_a_lower_rate_and_more_rays(scene):
+    """Twice `LONG_STEPS` steps halve the rate, but not the decay; with a budget, a step has four times as many rays.
 
-    def at_half(**options):
-        table = ("levels=2", "log2_entries=10")
-        state = build(TrainConfig(width=8, cells=(), rays=64, field_options=table, **options), scene)
+    Neither holds for tables in a box, and fields without tables keep their rays.
+    """
+
+    def at_half(field="hashgrid", **options):
+        table = ("levels=2", "log2_entries=10") if field == "hashgrid" else ()
+        state = build(TrainConfig(field=field, width=8, cells=(), rays=64, field_options=table, **options), scene)
         state.step, state.seconds = 3904, 50.0
         output = SimpleNamespace(loss=0.0, samples=10**9)  # so many samples that `next_rays` adds no rays
         prepare(state)
         state.read_output(output)
-        (rate, _), decay = (group["lr"] for group in state.optimizer.param_groups), state.optimizer.decay
+        rate, decay = state.optimizer.param_groups[0]["lr"], state.optimizer.decay
         return rate / state.config.lr, rate / state.config.lr * decay, state.rays
 
-    decay = lambda fraction: FINAL ** ((fraction - 0.25) / 0.75)  # noqa: E731
+    decay = lambda fraction, hold=0.25: FINAL ** ((fraction - hold) / (1 - hold))  # noqa: E731
     for options, length, fraction, rays in (
         ({"steps": 7808, "contraction": "sphere"}, 7808 / 3500, 0.5, 64),
         ({"steps": 7808}, 1, 0.5, 64),
         ({"budget": 100.0, "contraction": "sphere"}, 2, 0.5, 256),
         ({"budget": 100.0}, 1, 0.5, 64),
         ({"steps": 3600, "contraction": "none"}, 1, 1, 64),
+        ({"field": "nerf", "steps": 7808}, 7808 / 3500, 0.5, 64),
+        ({"field": "nerf", "budget": 100.0}, 2, 0.5, 64),
     ):
         rate, decayed, drawn = at_half(**options)
-        assert rate == pytest.approx(decay(fraction) / length, rel=5e-3) and drawn == rays
-        assert decayed == pytest.approx(decay(fraction), rel=5e-3)
+        expected = decay(fraction, 0.25 if "field" not in options else 0.0)
+        assert rate == pytest.approx(expected / length, rel=5e-3) and drawn == rays
+        assert decayed == pytest.approx(expected, rel=5e-3)
 
 
 @pytest.mark.native

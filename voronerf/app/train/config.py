@@ -167,9 +167,9 @@ class OptimiserSettings:
     """Precision of the networks' matrix products in training: float32, bfloat16, or float16 with a scaled loss. Sums,
     parameters and moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     lr: float | None = None
-    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths. On a hash
-    grid in contracted space, a training of more than 3,500 steps divides the rate by (number of steps) / 3,500, at most
-    by 8; with --budget, it multiplies the number of rays by the square of this factor."""
+    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths. Except on a
+    hash grid in a box, a training of more than 3,500 steps divides the rate by (number of steps) / 3,500, at most by 8.
+    On a hash grid with --budget, it multiplies the number of rays by the square of this factor."""
     average: float = 0.98
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. The decay is smaller in the
     first steps. Training itself uses the weights without averaging."""

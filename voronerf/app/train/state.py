@@ -183,10 +183,14 @@ class State:
 
     @property
     def relative_length(self) -> float:
-        """The length of a training of photographs relative to a short one, see :func:`schedule.relative_length`."""
-        if self.config.contraction == "none" or self.config.field_type.scene_options is None:
+        """The length relative to a short training, see :func:`schedule.relative_length`; 1 for tables in a box."""
+        if self.config.contraction == "none" and self._has_table:
             return 1.0
         return schedule.relative_length(self.step, self.fraction, self.config.steps)
+
+    @property
+    def _has_table(self) -> bool:
+        return self.config.field_type.scene_options is not None
 
     def steps_per_update(self) -> int:
         """Returns the number of next steps that can be made in one call, because no setting changes between them."""
@@ -220,7 +224,7 @@ class State:
         """Reads a step's loss, guard and sample count, which waits for the device; updates the number of rays."""
         self.loss, self.skipped_in_a_row = float(output.loss), int(self.guard.in_a_row)
         if self.sampler.grid is not None and (self.step - self.began) % schedule.GROUP == 0:
-            more = 1.0 if self.config.budget is None else self.relative_length**2
+            more = self.relative_length**2 if self._has_table and self.config.budget is not None else 1.0
             self.rays = next_rays(
                 self.rays,
                 output.samples,
