@@ -27,8 +27,8 @@ LONG_STEPS, MOST_LENGTH, CHEAP_STEPS = 3500, 8.0, 400
 def relative_length(step: int, fraction: float, steps: int | None = None) -> float:
     """Returns the length of a training: its number of steps / `LONG_STEPS`, 1..`MOST_LENGTH`.
 
-    The learning rate is divided by this length for fields without tables, and for tables in contracted space. A field
-    without tables trains longer at a high rate than its networks stand: Lego's 16 cells lost 9 dB in an hour.
+    The learning rate is divided by this length for fields without tables, and for tables in contracted space. Without
+    the division, 16 cells without tables reached 28.3 dB on Lego in five minutes, but 15.9 dB in an hour.
 
     Adam moves a table entry that few rays read by about the full rate, whatever the noise of its gradient. With more
     steps at the same rate, entries walk farther at random: pale fog beside the training rays becomes clouds with
