@@ -207,7 +207,7 @@ def _reload(training: Training, rng: random.Random) -> None:
 
 
 def _drop(training: Training, rng: random.Random) -> None:
-    rng.choice((training.optimizer.drop_averages, training.optimizer.state.clear, training.step.forget))()
+    rng.choice((training.optimizer.state.clear, training.step.forget))()
 
 
 def _no_gradients(training: Training, rng: random.Random) -> None:

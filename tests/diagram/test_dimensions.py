@@ -100,6 +100,13 @@ def test_from_points_draws_of_many_and_takes_any_shape(generator: torch.Generato
     assert VoronoiDiagram.from_points(points, 4, left, generator=generator).centres[:, 0].max() < 0.1
 
 
+def test_points_that_float32_cannot_tell_apart_are_one_point(generator: torch.Generator) -> None:
+    """The draw of many points has one point in float32, so that all points are needed."""
+    near = 0.5 + 1e-13 * torch.arange(30_000, dtype=torch.float64)[:, None].expand(-1, 3)
+    diagram = VoronoiDiagram.from_points(torch.cat((near, torch.eye(3).double())), 4, generator=generator)
+    assert diagram.num_cells == 4
+
+
 def test_from_points_takes_as_many_cells_as_distinct_points(generator: torch.Generator) -> None:
     points = torch.rand(120_000, 3, generator=generator)
     diagram = VoronoiDiagram.from_points(points, 25_000, centres="random", generator=generator)

@@ -7,6 +7,7 @@ from helpers import refuses, seeded
 from voronerf.diagram import VoronoiDiagram
 from voronerf.diagram.balance import cell_weights, imbalance
 from voronerf.diagram.subdivision import split_diagram
+from voronerf.router import VoronoiRouter
 
 ROOT = VoronoiDiagram(torch.tensor([[-2.0, 0, 0], [0, 0, 0], [2, 0, 0]]))
 
@@ -125,3 +126,11 @@ def test_bad_input_gets_one_clear_line():
     refuses("points must have shape [..., 3], got [6, 2]", split_diagram, ROOT, points[:, :2], importance, 2)
     refuses("split_diagram: importance must be finite", split_diagram, ROOT, points, importance / 0 * 0, 2)
     refuses("more cells than samples", split_diagram, ROOT, torch.zeros(0, 3), torch.zeros(0), 2)
+    router = VoronoiRouter(torch.nn.Linear(3, 1), torch.zeros(1, 3), coords="first3")
+    for children, shape, weights, message in (
+        (0, (6, 3), 6, "diagram must be at least 1 child for a cell, got 0"),
+        (4, (6, 2), 6, "points must have shape [m, 3], got [6, 2]"),
+        (4, (6, 3), 5, "weights must have shape [6], got [5]"),
+    ):
+        samples = {"points": torch.rand(shape), "weights": torch.ones(weights)}
+        refuses(f"VoronoiRouter.subdivide: {message}", router.subdivide, children, **samples)

@@ -230,8 +230,10 @@ def test_what_a_killed_command_left_is_removed_by_the_next(opened, tmp_path) -> 
     for name in (f".other.{child}.partial", f".other.{os.getppid()}.partial"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.json").touch()
+    (tmp_path / ".backup.2024-01-01.partial").mkdir()
     joined_run(opened, tmp_path / "run")
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f".other.{os.getppid()}.partial", "run"]
+    others = [".backup.2024-01-01.partial", f".other.{os.getppid()}.partial"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [*others, "run"]
 
 
 def test_out_is_a_new_folder(opened, tmp_path) -> None:

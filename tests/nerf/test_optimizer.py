@@ -157,9 +157,6 @@ def test_averages_are_exponential_over_a_growing_window(decay):
             assert torch.equal(weight.detach(), now)
             passed.append(not torch.equal(expected, now))
     assert len(passed) == 13 and any(passed)
-    optimizer.drop_averages()
-    with optimizer.averaged():
-        assert torch.equal(weight.detach(), now)
 
 
 @pytest.mark.parametrize("inherit", [True, False])
@@ -175,7 +172,6 @@ def test_children_have_the_average_of_their_parent(inherit):
     router.subdivide(
         VoronoiDiagram(torch.rand(4, 3)), torch.zeros(4, dtype=torch.int64), optimizer=optimizer, inherit=inherit
     )
-    if not inherit:
-        optimizer.drop_averages()
+    wanted = before.expand(4, 2, 3) if inherit else router.module.weight.detach().clone()
     with optimizer.averaged():
-        assert torch.equal(router.module.weight, before.expand(4, 2, 3)) == inherit
+        assert torch.equal(router.module.weight, wanted)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
@@ -65,6 +67,28 @@ def test_a_sampler_with_a_grid_is_fused_and_walks_pictures() -> None:
     pictures = [loss.renderer.render_colours(rays, batch.near, batch.far) for loss in losses]
     assert torch.equal(pictures[0].colour, pictures[1].colour) and losses[1].renderer.sampler.seen == 1
     assert losses[1].renderer.occupancy is grid
+
+
+def test_the_heaviest_samples_of_rays_with_different_numbers_of_samples() -> None:
+    """The picture of a sampler that only has ``sample`` names each ray's heaviest sample, or the ray's origin."""
+    torch.manual_seed(0)
+
+    class Packed(Borrowed):
+        render_colours = Sampler.render_colours
+
+    grid = OccupancyGrid(torch.tensor([[-1.0, -1, -1], [1.0, 1, 1]]), 8, threshold=0.1)
+    grid.occupied[4:] = False
+    renderer = Renderer({"field": NeRF(width=16, depth=2)}, Packed(Occupancy(grid, 16)))
+    starts = torch.tensor([[-0.5, 0, -2.0], [0.5, 0, -2], [-0.3, 0.1, -1.5]])
+    rays, near, far = Rays(starts, torch.tensor([[0.0, 0, 1]]).expand(3, 3)), torch.ones(3), torch.full((3,), 3.0)
+    last = renderer.render(rays, near, far)[-1]
+    ends = last.samples.ray_offsets.tolist()
+    wanted = starts.clone()
+    for ray, (begin, end) in enumerate(itertools.pairwise(ends)):
+        if end > begin:
+            wanted[ray] = last.samples.positions[begin + int(last.weights[begin:end].argmax())]
+    assert len({end - begin for begin, end in itertools.pairwise(ends)}) == 3
+    assert torch.equal(renderer.render_colours(rays, near, far).heaviest, wanted)
 
 
 @pytest.mark.native

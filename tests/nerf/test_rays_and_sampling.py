@@ -153,3 +153,5 @@ def test_the_last_rays_of_a_batch_may_be_triples_from_elsewhere():
     assert float(apart.min()) > 0 and float(apart.max()) < 0.15 * 3**0.5
     message = "RayBatches: unseen must be 0 with a box, since unseen rays may miss it, got 0.3"
     refuses(message, RayBatches, cameras, images, near=1.0, far=3.0, box=BOX, unseen=0.3)
+    nothing = torch.zeros(2, 30, 40, dtype=torch.bool)
+    refuses("masks and boxes must leave pixels", RayBatches, cameras, images, near=1.0, far=3.0, masks=nothing)

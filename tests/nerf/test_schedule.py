@@ -13,6 +13,7 @@ def test_a_long_run_warms_up_in_a_hundred_steps():
 def test_the_learning_rate_holds_and_falls():
     for hold, rates in (
         (0.25, (1, 0.05 ** (1 / 3), 0.05 ** (2 / 3), 0.05)),
+        (1.0, (1, 1, 1, 1)),
         (0.0, (0.05**0.25, 0.05**0.5, 0.05**0.75, 0.05)),
     ):
         result = [learning_rate(0.5, done, 1_000, hold=hold) / 0.5 for done in (0.25, 0.5, 0.75, 1.0)]

@@ -187,7 +187,6 @@ def test_a_replay_refuses_what_a_call_finds_wrong():
         lambda t: t.optimizer.param_groups[0]["betas"].__setitem__(0, 0.5),
         lambda t: t.optimizer.load_state_dict(t.optimizer.state_dict()),
         lambda t: t.optimizer.state.clear(),
-        lambda t: t.optimizer.drop_averages(),
         lambda t: t.router.module.colour.weight.requires_grad_(False),
         lambda t: t.router.module.colour.weight.register_hook(lambda gradient: 2 * gradient),
         lambda t: t.router.module.register_forward_hook(lambda *arguments: None),

@@ -14,6 +14,7 @@ from torch import Tensor
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.fields import NeRF
 from voronerf.router import VoronoiRouter
+from voronerf.router.cells import draw_parameters
 
 
 @pytest.fixture
@@ -67,6 +68,9 @@ def test_random_initialisation_is_fresh_and_reproducible(field: NeRF, generator:
         assert state["exp_avg"][:2].abs().sum() == 0 and state["exp_avg"][2:].abs().sum() > 0
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0][0], weights[0][1])
+    shared = VoronoiRouter(field, torch.zeros(1, 3), share=["trunk.0.weight"]).module
+    names = {name for name, _ in field.named_parameters()} - {"trunk.0.weight"}
+    assert draw_parameters(shared, 2, None).keys() == names  # a large shared table is not drawn
 
 
 def test_copies_and_the_wrapped_field_are_independent(field: NeRF, generator: torch.Generator) -> None:

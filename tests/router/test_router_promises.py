@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from helpers import same
 from ops.foreign_fields import skip_net
 from ops.foreign_kinds import ENCODED, PYTORCH, Scales, seen
 from ops.foreign_rows import Case, Row
@@ -195,6 +196,18 @@ def test_resuming_after_a_split_in_the_order_of_nerf_pytorch(row: Row) -> None:
     assert again.num_cells == 4
     for a, b in zip(again.parameters(), router.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("stored", [5, 6])
+def test_a_state_that_does_not_fit_changes_nothing(stored: int) -> None:
+    router = VoronoiRouter(nn.Linear(3, 1), centres(), coords="first3")
+    before = copy.deepcopy(router.state_dict())
+    other = VoronoiRouter(nn.Linear(3, 2), centres(stored), coords="first3").state_dict()
+    missing = {name: value for name, value in other.items() if name != "module.weight"}
+    for state, actual in ((other, rf"\[{stored}, 2, 3\]"), (missing, "nothing")):
+        with pytest.raises(RuntimeError, match=rf"module.weight must have shape \[{stored}, 1, 3\], got {actual}"):
+            nn.ModuleDict({"field": router}).load_state_dict({f"field.{name}": value for name, value in state.items()})
+        assert same(before, router.state_dict())
 
 
 @pytest.mark.parametrize("make", [torch.optim.Adam, torch.optim.Adagrad, torch.optim.SGD, torch.optim.LBFGS])

@@ -122,6 +122,21 @@ def test_a_fused_optimiser_with_the_state_of_other_cells_is_stopped(generator: t
     new.step()
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_each_of_several_optimisers_is_stopped(given: bool, generator: torch.Generator) -> None:
+    router, x = router_of(net(), generator, k=1), torch.rand(20, 3, generator=generator)
+    first, *others = router.parameters()
+    right, stale = torch.optim.SGD([first], 0.1, momentum=0.9), torch.optim.Adam(others)
+    router(x).sum().backward()
+    stale.step()
+    parents, finer = torch.zeros(4, dtype=torch.int64), VoronoiDiagram(torch.rand(4, 3, generator=generator))
+    router.subdivide(finer, parents, optimizer=right if given else None)
+    router(x).sum().backward()
+    right.step()
+    with pytest.raises(ValueError, match=r"\(Adam\) holds the state of other cells"):
+        stale.step()
+
+
 def test_optimisers_that_train_something_are_not_told(generator: torch.Generator) -> None:
     fields, other, x = [net() for _ in range(3)], net(), torch.rand(20, 3, generator=generator)
     routers = [router_of(field, generator) for field in fields]

@@ -407,15 +407,19 @@ def test_data_parallel(generator: torch.Generator, tmp_path: Any) -> None:
     wanted = [p.grad.clone() for p in router.parameters()]
     torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
     try:
-        wrapped = nn.parallel.DistributedDataParallel(router)
+        wrapped, before = nn.parallel.DistributedDataParallel(router), copy.deepcopy(router.state_dict())
         for _ in range(3):
             router.zero_grad()
             wrapped(x).square().sum().backward()
         for parameter, gradient in zip(router.parameters(), wanted, strict=True):
             torch.testing.assert_close(parameter.grad, gradient)
         router.subdivide(2, points=x[:, :3])
-        refuses("wraps the parameters from before subdivide; wrap the router again", wrapped, x, error=RuntimeError)
-        nn.parallel.DistributedDataParallel(router)(x).sum().backward()
+        message = "wraps the parameters of another number of cells; wrap the router again after subdivide or load"
+        refuses(message, wrapped, x, error=RuntimeError)
+        wrapped = nn.parallel.DistributedDataParallel(router)
+        wrapped(x).sum().backward()
+        router.load_state_dict(before)
+        refuses(message, wrapped, x, error=RuntimeError)
     finally:
         torch.distributed.destroy_process_group()
 

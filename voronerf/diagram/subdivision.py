@@ -164,7 +164,15 @@ def finer_diagram(
             )
         if points is None or parents is not None:
             raise ValueError("VoronoiRouter.subdivide: a number of children needs points, and no parents")
+        if finer < 1:
+            raise ValueError(f"VoronoiRouter.subdivide: diagram must be at least 1 child for a cell, got {finer}")
+        if points.shape[-1:] != present.centres.shape[1:]:
+            rule = f"VoronoiRouter.subdivide: points must have shape [m, {present.centres.shape[1]}]"
+            raise ValueError(f"{rule}, got {list(points.shape)}")
         weights = points.new_ones(points.shape[:-1]) if weights is None else weights
+        if weights.shape != points.shape[:-1]:
+            rule = f"VoronoiRouter.subdivide: weights must have shape {list(points.shape[:-1])}"
+            raise ValueError(f"{rule}, got {list(weights.shape)}")
         generator = split["generator"]
         if generator is not None and generator.device.type != "cpu":
             seed = torch.randint(2**62, (), generator=generator, device=generator.device)

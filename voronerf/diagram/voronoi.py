@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from voronerf import ops
-from voronerf.diagram.balance import balance, in_space, in_torch
+from voronerf.diagram.balance import balance, first_distinct, in_space, in_torch
 from voronerf.diagram.drawing import draw_cell
 from voronerf.ops._core import backends
 from voronerf.ops._core.checks import check_integer
@@ -146,7 +146,7 @@ class VoronoiDiagram(nn.Module):
         count = max(_DECIDE, _DECIDE_CELL * k)
         if len(flat) > count and len(weights) == len(flat):
             drawn = torch.randperm(len(flat), generator=generator, device="cpu")[:count].to(flat.device)
-            enough = len(torch.unique(flat[drawn], dim=0)) >= k and bool((weights[drawn] > 0).any())
+            enough = len(first_distinct(flat[drawn].float(), k)) >= k and bool((weights[drawn] > 0).any())
             if enough:  # otherwise all points are needed
                 flat, weights = flat[drawn], weights[drawn]
         return cls(balance(flat, weights, k, centres=centres, generator=generator).centres)

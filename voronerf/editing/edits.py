@@ -563,7 +563,8 @@ def _write(source: RunContents, out: Path) -> RunContents:
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     for leftover in out.parent.glob(".*.[0-9]*.partial"):
-        if not _process_exists(int(leftover.suffixes[-2][1:])):  # the process that wrote it was killed
+        number = leftover.suffixes[-2][1:]
+        if number.isdecimal() and not _process_exists(int(number)):  # the process that wrote it was killed
             shutil.rmtree(leftover, ignore_errors=True)
     partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
     try:

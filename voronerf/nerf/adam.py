@@ -216,11 +216,6 @@ class Adam(torch.optim.Adam):
         if weights:
             average(averages, weights, varying(self._average_rate), backend=self.backend)
 
-    def drop_averages(self) -> None:
-        """Drops all averages; the next update starts new averages from the weights."""
-        for state in self.state.values():
-            state.pop(_AVERAGE, None)
-
     @contextmanager
     def averaged(self) -> Iterator[None]:
         """Replaces the weights by their averages within the context; weights without an average do not change."""

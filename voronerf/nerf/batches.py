@@ -157,7 +157,9 @@ class RayBatches:
             last = (edges == -1).nonzero(as_tuple=True)[1]
             runs.append(torch.stack(((image * cameras.height + row) * cameras.width + column, last - column)))
         start, length = torch.cat(runs, dim=1)
-        return PixelRuns.of(start, length) if 0 < int(length.sum()) < self._pixel_count else None
+        if not (count := int(length.sum())):
+            raise ValueError("RayBatches: masks and boxes must leave pixels to draw rays of, got none")
+        return PixelRuns.of(start, length) if count < self._pixel_count else None
 
     @property
     def _pixel_count(self) -> int:

@@ -162,8 +162,10 @@ class Renderer:
         last = self.render(rays, near, far, background=background)[-1]
         places = rays.origins
         if heaviest:
-            positions, weights = (last.samples.by_ray(values) for values in (last.samples.positions, last.weights))
-            places = positions[torch.arange(len(rays), device=places.device), weights.argmax(-1)]
+            index, numbers = last.samples.ray_index.long(), torch.arange(len(last.weights), device=places.device)
+            largest = last.weights.new_zeros(len(rays)).scatter_reduce(0, index, last.weights, "amax")
+            numbers = numbers[last.weights == largest[index]]
+            places = places.index_copy(0, index[numbers], last.samples.positions[numbers])
         return RayColours(last.colour, last.opacity, last.depth, places)
 
     @torch.no_grad()

@@ -22,6 +22,8 @@ FILL, FILL_SAMPLES, CONTRACTED_FILL_SAMPLES = 0.25, 64, 128
 #: The number of steps from which a training is long, and the maximum of `relative_length`. An estimate of the number
 #: of steps leaves out the first `CHEAP_STEPS` steps, which have few strata.
 LONG_STEPS, MOST_LENGTH, CHEAP_STEPS = 3500, 8.0, 400
+#: The maximum number of strata in a step, which is the largest ``capacity`` of `ops.march_rays`.
+MOST_STRATA = 2**27
 
 
 def relative_length(step: int, fraction: float, steps: int | None = None) -> float:
@@ -59,7 +61,7 @@ def learning_rate(lr: float, fraction: float, step: int, *, hold: float = 0.0, b
     """
     warmup = max((step - began) / WARMUP_STEPS, 0.0 if began else fraction / WARMUP)
     factor = 0.01 + 0.99 * warmup if warmup < 1 else 1.0
-    decay = max(0.0, fraction - hold) / (1 - hold)
+    decay = max(0.0, fraction - hold) / max(1 - hold, 1e-9)
     return lr * factor * math.exp(math.log(FINAL) * decay)
 
 

@@ -116,8 +116,8 @@ replayed(SampleReservoir)
 class Strategy:
     """The base class of rules for splitting cells in a training; this class itself never splits a cell.
 
-    Before each step the training loop checks :meth:`is_due`. If a split is due, the loop calls
-    :meth:`step_pre_backward`, the only hook that may change networks and optimiser. After the optimiser, each step
+    Before each step the training loop calls :meth:`step_pre_backward`, which splits if :meth:`is_due`. It is the only
+    hook that may change networks and optimiser. After the optimiser, each step
     calls :meth:`step_post_backward`, which may change only the strategy itself. The tensors that the hook receives
     belong to the step, and must be read before the hook returns. A subclass's own hooks run in Python in every
     step; see :class:`TrainingStep`.

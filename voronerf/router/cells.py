@@ -334,8 +334,9 @@ def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
     parameter.data, parameter.grad = values, None
 
 
-def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
-    """Draws the parameters of a plain module k times; returns them as [k, ...], by name."""
+def draw_parameters(routed: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:
+    """Draws the parameters of k cells of a routed module; returns them as [k, ...], by name. Shared ones stay."""
+    template, ours = plain_cell(routed, 0), {id(parameter) for parameter in cell_parameters(routed)}
     parts = {"": template} if hasattr(template, "reset_parameters") else dict(template.named_modules())
     for name, part in parts.items():
         if not hasattr(part, "reset_parameters") and any(p is not None for p in part._parameters.values()):
@@ -343,7 +344,8 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
                 f"{_OP}.subdivide: inherit=False needs a field with reset_parameters(), or layers that have it; "
                 f"`{name}`, a {type(part).__name__}, has none"
             )
-    draws: dict[str, list[Tensor]] = {name: [] for name, _ in template.named_parameters()}
+    names = [name for name, parameter in routed.named_parameters() if id(parameter) in ours]
+    draws: dict[str, list[Tensor]] = {name: [] for name in names}
     # fork_rng also saves the GPUs' states, because manual_seed changes them. Without a generator, torch's is used.
     with torch.random.fork_rng() if generator is not None else contextlib.nullcontext():
         if generator is not None:
@@ -352,8 +354,8 @@ def draw_parameters(template: nn.Module, k: int, generator: torch.Generator | No
             for part in parts.values():
                 if hasattr(part, "reset_parameters"):
                     part.reset_parameters()  # type: ignore[operator]
-            for name, parameter in template.named_parameters():
-                draws[name].append(parameter.detach().clone())
+            for name in names:
+                draws[name].append(template.get_parameter(name).detach().clone())
     return {name: torch.stack(values) for name, values in draws.items()}
 
 

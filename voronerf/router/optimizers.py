@@ -16,6 +16,7 @@ from voronerf.router.grouping import cell_parameters
 _OP = "VoronoiRouter"
 #: Names of optimisers' state tensors that hold means or sums of gradients, or of their squares.
 MOMENTS = {"exp_avg", "exp_avg_sq", "max_exp_avg_sq", "exp_inf", "momentum_buffer", "grad_avg", "square_avg", "sum"}
+AVERAGES = {"average", "ax"}  # names of state tensors that hold averages of the parameter itself
 PATIENCE = 64  # calls before a check ends; gradient accumulation makes several calls per step
 
 
@@ -48,7 +49,8 @@ def move_state(
         parents: The parent of each new cell among the k old cells, int64 [new cells].
         k: The number of old cells.
         shares: The number n of cells that share the samples of each new cell's parent, int64 [new cells].
-        fresh: The mask of new cells whose state becomes 0, bool [new cells]; None for no cells.
+        fresh: The mask of new cells whose parameters were drawn, bool [new cells]; None for no cells. Their averages
+            become the parameters, and other state becomes 0.
     """
     is_reset, groups = False, {id(p): group for group in optimizer.param_groups for p in group["params"]}
     for parameter in cell_parameters(module):
@@ -65,7 +67,8 @@ def move_state(
                     if steady is not None and key.endswith("exp_avg_sq"):
                         state[key] *= 1 - steady[rows] * (1 - 1 / n)
                 if fresh is not None:
-                    state[key][fresh.to(value.device)] = 0
+                    drawn = fresh.to(value.device)
+                    state[key][drawn] = parameter.detach()[drawn].to(value) if key in AVERAGES else 0
             else:
                 is_reset |= isinstance(value, list) or (isinstance(value, Tensor) and value.dim() > 0)
     if is_reset:
@@ -110,28 +113,32 @@ def is_stale(optimizer: torch.optim.Optimizer, parameter: Any) -> bool:
     return any(isinstance(v, Tensor) and v.dim() > 0 and v.shape != parameter.shape for v in state.values())
 
 
-def watch_optimizers(module: nn.Module, line: str) -> list[Any]:
-    """Makes a module's optimisers raise at their next step if their state has another number of cells.
+def watch_optimizers(module: nn.Module, line: str, given: torch.optim.Optimizer | None) -> list[Any]:
+    """Makes a module's optimisers but ``given`` raise at their next step if their state has another number of cells.
 
     PyTorch's fused optimisers would write past the end of stale state. PyTorch keeps no list of optimisers, so the
     garbage collector's objects are searched. The error suggests the code ``line``. Returns the hooks' handles.
     """
-    watched = {id(parameter): weakref.ref(parameter) for parameter in cell_parameters(module)}
+    handles, ours = [], {id(parameter) for parameter in cell_parameters(module)}
+    for optimizer in [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]:
+        own = [p for group in optimizer.param_groups for p in group["params"] if id(p) in ours]
+        if own and optimizer is not given:
+            handles.append(optimizer.register_step_pre_hook(_first_step_check(own, line)))
+    return handles
 
-    def ours(optimizer: torch.optim.Optimizer) -> list[Any]:
-        own = [p for group in optimizer.param_groups for p in group["params"] if id(p) in watched]
-        return [p for p in own if watched[id(p)]() is p]
+
+def _first_step_check(parameters: list[Tensor], line: str) -> Callable[..., None]:
+    """Returns a hook that checks an optimiser's state of some parameters in its first call."""
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
-        if any(is_stale(optimizer, parameter) for parameter in ours(optimizer)):
+        if any(is_stale(optimizer, parameter) for parameter in parameters):
             raise ValueError(
                 f"{_OP}: optimizer ({type(optimizer).__name__}) holds the state of other cells than the router "
                 f"has; write {line}, or make the optimizer afterwards"
             )
-        watched.clear()  # torch does not let a hook remove itself
+        parameters.clear()  # torch does not let a hook remove itself
 
-    optimizers = [item for item in gc.get_objects() if issubclass(type(item), torch.optim.Optimizer)]
-    return [optimizer.register_step_pre_hook(check) for optimizer in optimizers if ours(optimizer)]
+    return check
 
 
 class Untrained:

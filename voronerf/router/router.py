@@ -38,7 +38,7 @@ from voronerf.router.cells import (
     stack_parameters,
 )
 from voronerf.router.dispatch import Dispatch
-from voronerf.router.grouping import Assigned, Grouping
+from voronerf.router.grouping import Assigned, Grouping, cell_parameters
 from voronerf.router.labels import Labels
 from voronerf.router.optimizers import (
     FrozenRows,
@@ -345,7 +345,7 @@ class VoronoiRouter(nn.Module):
             cells: Numbers of cells, or bool [k]; None for all. Cells that were frozen before stay frozen.
             optimizer: The optimiser that holds this router's parameters; each later step restores the values of frozen
                 cells. :class:`voronerf.nerf.Adam` skips frozen cells by itself. If an optimiser that was not passed
-                changes frozen cells in its first step, the next call raises.
+                changes frozen cells in its first steps, a later call raises.
 
         Raises:
             ValueError: For a cell number out of range, a mask of another length, or an optimiser that holds none of the
@@ -416,9 +416,10 @@ class VoronoiRouter(nn.Module):
 
         Parameters are copied from the parent. With ``optimizer``, the state of Adam, AdamW, RAdam, SGD and similar
         optimisers is copied too. Moments are divided by the number of children, which share the parent's samples, but
-        not if Adam soon forgets them (``betas[1]`` up to 0.99). The state of other optimisers is reset, with a warning.
-        The parameter objects stay the same, so groups, learning rates and schedules continue. A wrapper with parameters
-        of its own, such as ``DistributedDataParallel``, must be made again.
+        not if Adam soon forgets them (``betas[1]`` up to 0.99) or if labels choose the networks. The state of other
+        optimisers is reset, with a warning. The parameter objects stay the same, so groups, learning rates and
+        schedules continue. A wrapper with parameters of its own, such as ``DistributedDataParallel``, must be made
+        again.
 
         Args:
             diagram: The finer diagram, as :meth:`VoronoiDiagram.refine` returns it, or the number of children of each
@@ -465,7 +466,7 @@ class VoronoiRouter(nn.Module):
         # Marks the children of split cells. Other cells keep their values, with or without inheritance.
         children = torch.bincount(parents, minlength=k)[parents]
         new = children > 1
-        fresh = None if inherit else draw_parameters(plain_cell(self.module, 0), len(new), self.generator)
+        fresh = None if inherit else draw_parameters(self.module, len(new), self.generator)
         renew_cells(self.module, parents, fresh, new)
         self.diagram, self._positions_unchecked = copy.deepcopy(finer).to(self.diagram.centres.device), True
         self._resized = True
@@ -474,15 +475,14 @@ class VoronoiRouter(nn.Module):
         if optimizer is not None:
             shares = children if self._d else torch.ones_like(children)  # labels have samples of their own
             move_state(optimizer, self.module, parents, k, shares, None if fresh is None else new)
-        else:
-            self._watch_optimizers("router.subdivide(..., optimizer=optimizer)")
+        self._watch_optimizers("router.subdivide(..., optimizer=optimizer)", optimizer)
         return parents
 
-    def _watch_optimizers(self, line: str) -> None:
+    def _watch_optimizers(self, line: str, given: torch.optim.Optimizer | None = None) -> None:
         """Makes an optimiser with state of another number of cells raise at its next step; the error names ``line``."""
         for watch in self._watches:
             watch.remove()
-        self._watches = watch_optimizers(self.module, line)
+        self._watches = watch_optimizers(self.module, line, given)
 
     @torch.inference_mode(False)
     @torch.no_grad()
@@ -510,6 +510,7 @@ class VoronoiRouter(nn.Module):
         Raises:
             TypeError: If the state is not a mapping, or one of its keys is not a string.
             ValueError: If the optimiser holds none of the router's parameters.
+            RuntimeError: If the parameters have other shapes than the router's; the router is unchanged.
         """
         if not isinstance(state_dict, Mapping):
             raise TypeError(f"load_state_dict: state_dict must be a mapping, got {type(state_dict).__name__}")
@@ -534,20 +535,24 @@ class VoronoiRouter(nn.Module):
                 )
         else:
             diagram, k = VoronoiDiagram.from_state(state_dict, f"{prefix}diagram."), self.num_cells
+            ours, strict = set(map(id, cell_parameters(self.module))), args[1]
+            for name, parameter in self.module.named_parameters():
+                wanted, value = [diagram.num_cells, *parameter.shape[1:]], state_dict.get(f"{prefix}module.{name}")
+                if id(parameter) in ours and (strict if value is None else list(value.shape) != wanted):
+                    actual = "nothing" if value is None else list(value.shape)
+                    raise RuntimeError(
+                        f"VoronoiRouter.load_state_dict: {prefix}module.{name} must have shape {wanted}, got {actual}"
+                    )
             self.diagram = diagram.to(self.diagram.centres.device)
             if diagram.num_cells != k:
                 renew_cells(self.module, torch.zeros(diagram.num_cells, dtype=torch.int64, device="cpu"))
                 self._set_frozen(None)
+                self._resized = True
                 self._watch_optimizers("router.load_state_dict(state, optimizer=optimizer)")
         self._drop_frozen_checks()
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     # Calls ------------------------------------------------------------------------------------------------------------
-
-    @property
-    def field(self) -> nn.Module:
-        """The field with stacked parameters, whose own ``forward`` cannot be called."""
-        return self.module
 
     def assign(self, positions: Tensor) -> Tensor:
         """Returns the cell that evaluates each position: positions [n, d] -> int32 [n]."""
@@ -760,8 +765,8 @@ class VoronoiRouter(nn.Module):
         expected = wrapper._get_ddp_logging_data()["total_parameter_size_bytes"]
         if expected != sum(p.numel() * p.element_size() for p in wrapper._module_parameters if p.requires_grad):
             raise RuntimeError(
-                "VoronoiRouter: DistributedDataParallel wraps the parameters from before subdivide; wrap the "
-                "router again, on all ranks"
+                "VoronoiRouter: DistributedDataParallel wraps the parameters of another number of cells; wrap "
+                "the router again after subdivide or load_state_dict, on all ranks"
             )
         self._resized = False
 

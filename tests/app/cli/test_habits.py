@@ -18,6 +18,7 @@ from voronerf.app.cli import info, main, train
 from voronerf.app.cli.compare import shown, written
 from voronerf.app.evaluate.panels import picture_of_colour
 from voronerf.app.run import open_run
+from voronerf.app.train import TensorBoard
 from voronerf.app.train.config import TrainConfig
 from voronerf.app.train.run_directory import read_curve
 from voronerf.nerf import orbit_cameras
@@ -168,6 +169,17 @@ def test_tensorboard(tmp_path, fails, monkeypatch):
     monkeypatch.setattr("voronerf.app.cli.train.load_scene", None)  # the package is checked before data is read
     fails("needs tensorboard: pip install 'voronerf[tensorboard]'", "train --tensorboard --out", tmp_path / "x", TINY)
     assert not (tmp_path / "x").exists()
+
+
+def test_tensorboard_has_the_evaluation_that_a_resume_makes_up_for(tmp_path, monkeypatch):
+    written = []
+    writer = SimpleNamespace(add_scalar=lambda *entry: written.append(entry), close=lambda: None)
+    monkeypatch.setattr("voronerf.app.train.callbacks.tensorboard_writer", lambda: lambda *_, **__: writer)
+    lines = [{"step": 12, "psnr": 20.0}, {"step": 24, "psnr": 21.0}]  # the second by `Scores.on_start`
+    board = TensorBoard(tmp_path, SimpleNamespace(metrics=lines))
+    board.on_start(SimpleNamespace(step=24))
+    board.on_end(SimpleNamespace(step=24))
+    assert written == [("test/psnr", 21.0, 24)]
 
 
 def test_a_training_without_options_says_what_to_try(monkeypatch, tmp_path, capsys):

@@ -34,6 +34,7 @@ from voronerf.app.evaluate.panels import write_panels
 from voronerf.app.scenes import SceneError, builtin_scene, images, load_scene, photographs
 from voronerf.app.scenes.colmap import read_model
 from voronerf.app.scenes.photographs import find_frame
+from voronerf.app.scenes.regions import region_of
 from voronerf.app.scenes.scene import KnownDepths
 from voronerf.app.train import Callback, ConfigError, TrainConfig, train
 from voronerf.app.train.build import ROBUST, build, make_batches, make_renderer, make_routers
@@ -783,3 +784,10 @@ def test_points_that_two_images_see_are_left_out(tmp_path):
         lines[number] = " ".join(lines[number].split()[: 8 + 2 * seen])
     path.write_text("\n".join(lines) + "\n")
     assert read_model(tmp_path / "sparse/0").numbers.tolist() == list(range(1, len(POINTS)))
+
+
+def test_a_small_view_within_a_region_is_kept():
+    scene = builtin_scene(16, train_views=2, test_views=2)
+    cameras = replace(scene.test.cameras, sizes=torch.tensor([[6, 6], [16, 16]]))
+    box = torch.tensor([[-2.0] * 3, [2.0] * 3])
+    assert len(region_of(replace(scene, test=replace(scene.test, cameras=cameras)), box).test) == 2

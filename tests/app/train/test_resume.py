@@ -130,7 +130,7 @@ def without(prefix):
         ("stage 1: cells must be an integer, got 4.5", lambda c: c.values["stages"][1].update(cells=4.5)),
         ("stage 0: split_cells missing", lambda c: c.values["stages"][0].pop("split_cells")),
         ("step, times and stages must be counts, got 14, [inf", lambda c: c.values.update(seconds=math.inf)),
-        ("rays must lie in 64 to 64 by its settings, got 65", lambda c: c.values.update(rays=65)),
+        ("rays must lie in 64 to 4096 by its settings, got 4097", lambda c: c.values.update(rays=4097)),
         ("seconds missing", lambda c: c.values.pop("seconds")),
         ("settings: width must be an integer or null, got '8'", lambda c: c.values["config"].update(width="8")),
         ("settings: cells must be a list, each entry an integer", lambda c: c.values["config"].update(cells=[True])),
@@ -247,6 +247,15 @@ def test_turns_leave_checkpoints(tmp_path, scene):
         train(state, [checkpoints], until=state.seconds + 1e-4, clock=lambda: 0.01 * next(ticks))  # takes one step
     checkpoints.writer.wait()
     assert checkpoint_path(tmp_path).exists()
+
+
+def test_the_checkpoint_after_the_last_step_has_the_cleaned_grid(tmp_path, scene, monkeypatch):
+    """A process that ends before the cleaning leaves an earlier checkpoint, from which a resume cleans the grid."""
+    done = []
+    monkeypatch.setattr(Checkpoints, "save", lambda self, state: done.append(state.step))
+    monkeypatch.setattr("voronerf.nerf.Stratified.finish", lambda *_: done.append("cleaned"))
+    run(build(small(tmp_path, steps=3), scene), [Checkpoints(tmp_path, interval=0)])
+    assert done[-2:] == ["cleaned", 3] and done.count(3) == 1 and len(done) > 2
 
 
 def test_a_change_of_threads_is_said_where_torch_computes(scene, tmp_path):

@@ -18,7 +18,7 @@ from voronerf.app.evaluate.scores import evaluate
 from voronerf.app.files import read_json_lines
 from voronerf.app.render.camera import render_camera
 from voronerf.app.scenes import builtin_scene
-from voronerf.app.train import ConfigError, TrainConfig, build, loop, run, train
+from voronerf.app.train import ConfigError, TrainConfig, build, load, loop, run, snapshot, train
 from voronerf.app.train.build import count_parameters, solve_width
 from voronerf.app.train.defaults import octaves_for, resolve
 from voronerf.app.train.loop import prepare
@@ -176,6 +176,9 @@ def test_parameters_decide_the_width(scene, field):
     again = build(replace(small(field=field, parameters=30_000, width=None, depth=None), **HIERARCHICAL), scene)
     assert again.config.width < config.width  # two networks share the parameters
     refuses("--parameters must be at least", build, small(parameters=7), scene, error=ConfigError)
+    both = small(parameters=30_000, field=field)
+    refuses("--width must be left out with --parameters, which decide", build, both, scene, error=ConfigError)
+    assert build(config, scene).config == config  # as a resume does
 
 
 def test_octaves_follow_the_pixels(scene):
@@ -317,6 +320,28 @@ def test_long_trainings_have_a_lower_rate_and_more_rays(scene):
         expected = decay(fraction, 0.25 if "field" not in options else 0.0)
         assert rate == pytest.approx(expected / length, rel=5e-3) and drawn == rays
         assert decayed == pytest.approx(expected, rel=5e-3)
+
+
+def test_long_trainings_in_empty_space_can_be_resumed(scene, monkeypatch):
+    """A checkpoint with the most rays is readable; a step has at most the strata that `march_rays` can hold."""
+    table = ("levels=2", "log2_entries=10")
+    settings = {"field": "hashgrid", "contraction": "sphere", "cells": (), "field_options": table, "budget": 100.0}
+    for most, rays in ((2**27, 64 * 4 * 8), (16 * 1000, 1000)):
+        monkeypatch.setattr("voronerf.nerf.schedule.MOST_STRATA", most)
+        state = steps_of(build(TrainConfig(width=8, rays=64, samples=(64,), **settings), scene), 1)
+        state.step, state.seconds, state.rays = 3904, 50.0, 2048
+        state.read_output(SimpleNamespace(loss=0.0, samples=0))
+        assert state.rays == rays and state.sampler.strata == 16
+        load(build(state.config, scene), snapshot(state))
+
+
+def test_a_gpu_reads_the_loss_after_a_restart_too():
+    read = []
+    for step in range(200, 400, 16):  # a restart at step 200
+        state = SimpleNamespace(device=SimpleNamespace(type="cuda"), step=step, began=200, count_steps=lambda *_: None)
+        state.read_output = lambda output, step=step: read.append(step)
+        loop.count(state, 16, SimpleNamespace(rays=64))
+    assert read == [200, 248, 296, 344, 392]
 
 
 @pytest.mark.native

@@ -389,7 +389,10 @@ def test_a_training_is_the_same_with_a_viewer(tmp_path, scene, monkeypatch) -> N
 
 def test_nothing_is_rendered_for_nobody(scene) -> None:
     state = build(TrainConfig(steps=4, cells=(), rays=64, samples=(8,), evaluations=1), scene)
-    training = watch(state, Scores(None), port=0)
+    scores = Scores(None)
+    scores.metrics = [{"seconds": 1.0, "step": 1, "part": 1, "psnr": None}]  # was NaN
+    training = watch(state, scores, port=0)
+    training.tell()
     calls = []
     state.renderer.image = lambda *args, **options: calls.append(args)
     train(state, [training])

@@ -7,6 +7,7 @@ Source: Turki et al. 2022, "Mega-NeRF", section 3: the pixels of a region are th
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -48,7 +49,8 @@ def region_of(scene: Scene, box: Tensor) -> Scene:
         _, first, last = test.cameras.image_rays_between(view, **bounds)
         mask = test.mask(view)
         masks[view, :height, :width] = (last > first).view(height, width) & (True if mask is None else mask)
-    shares = masks.flatten(1).count_nonzero(1) / masks[0].numel()
+    pixels = torch.tensor([math.prod(test.cameras.size(view)) for view in range(len(test))], device="cpu")
+    shares = masks.flatten(1).count_nonzero(1) / pixels
     if not shares.any():
         raise SceneError(f"{scene.name}: region must be seen by a test view, got {box.tolist()}")
     seeing = (shares >= min(SEEN, float(shares.max()) / 2)).nonzero()[:, 0]

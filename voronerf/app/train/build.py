@@ -86,11 +86,14 @@ def build(
         >>> state.step, state.router.num_cells
         (3, 4)
     """
+    given = config.width
     config = resolve(replace(config, device=present_device(config.device)), scene, speed)
     if config.assignment == "stochastic" and ranks.size > 1:  # draws a number for each sample, and samples differ
         raise ConfigError("--assignment must be nearest with several processes, got stochastic")
     if config.parameters is not None:
         width = solve_width(config, config.parameters)
+        if given not in (None, width):
+            raise ConfigError(f"--width must be left out with --parameters, which decide {width}, got {given}")
         lr = config.field_type.learning_rate({**config.network_options, "width": width})
         config = replace(config, width=width, lr=lr if config.lr is None else config.lr)
     check_memory(config)

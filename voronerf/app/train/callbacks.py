@@ -29,7 +29,7 @@ from voronerf.app.train.run_directory import read_metrics
 from voronerf.app.train.start import rate_advice, usual_rate
 from voronerf.app.train.state import State
 from voronerf.nerf.schedule import GROUP
-from voronerf.nerf.split import MIN_SAMPLES, SplitDone
+from voronerf.nerf.split import SplitDone
 
 #: Seconds of training between checkpoints, and the number of kept checkpoints.
 CHECKPOINT_EVERY, KEPT = 30.0, 3
@@ -87,11 +87,14 @@ class Checkpoints(Callback):
                 f"{counted(stage.cells, 'cell')} {when}{balance if state.config.centres == 'balanced' else ''}"
             )
         else:
-            state.report(f"no cell split {when}: none holds {MIN_SAMPLES} of the {len(done.points)} samples kept")
+            state.report(f"no cell split {when}: none holds enough distinct samples of the {len(done.points)} kept")
 
     def after_step(self, state: State) -> None:
-        """Starts writing a checkpoint when it is due, unless another one is being written."""
-        if state.seconds - self.saved_at >= self.interval and not self.writer.busy:
+        """Starts writing a checkpoint when it is due, unless another one is being written.
+
+        ``on_end`` writes the one after the last step, since the training ends by cleaning its grid.
+        """
+        if state.fraction < 1 and state.seconds - self.saved_at >= self.interval and not self.writer.busy:
             self.save(state)
 
     def on_end(self, state: State) -> None:
@@ -392,7 +395,8 @@ class TensorBoard(Callback):
 
     def on_start(self, state: State) -> None:
         """Opens the event file; on a resume, TensorBoard hides the old entries of later steps."""
-        self.writer, self.written = self._make(str(self.folder), purge_step=state.step + 1), len(self.scores.metrics)
+        self.writer = self._make(str(self.folder), purge_step=state.step + 1)
+        self.written = sum(line["step"] < state.step for line in self.scores.metrics)  # `scores` may have added one
 
     def after_step(self, state: State) -> None:
         """Writes the state after a step, and new evaluations."""

@@ -153,7 +153,8 @@ class SamplingSettings:
     contraction: Literal["auto", "none", "sphere", "ndc"] = "auto"
     """Input space of the networks: unchanged (none); all points outside a sphere mapped into a shell up to twice its
     radius (sphere); or normalised device coordinates, for forward-facing scenes (ndc). auto is none for a scene with a
-    box and for fields without a hash grid, otherwise ndc for forward-facing cameras and sphere for other cameras."""
+    box (sphere with --region) and for fields without a hash grid, otherwise ndc for forward-facing cameras and sphere
+    for other cameras."""
     occupancy: bool = True
     """Skip samples in empty space, in training and in pictures. This needs a field that takes points (not cones),
     sampling in a single pass, and a scene with a box or a contraction; it is off otherwise."""
@@ -167,9 +168,10 @@ class OptimiserSettings:
     """Precision of the networks' matrix products in training: float32, bfloat16, or float16 with a scaled loss. Sums,
     parameters and moments are float32. A CPU multiplies in float32 and rounds only the outputs of the networks."""
     lr: float | None = None
-    """Initial learning rate of Adam; default: 0.02 up to width 64, inversely proportional to larger widths. Except on a
-    hash grid in a box, a training of more than 3,500 steps divides the rate by (number of steps) / 3,500, at most by 8.
-    On a hash grid with --budget, it multiplies the number of rays by the square of this factor."""
+    """Initial learning rate of Adam; default: 0.02; for nerf, mipnerf and kilonerf inversely proportional to widths
+    above 64; 0.001 for a registered field without a rule. Except on a hash grid in a box, a training of more than 3,500
+    steps divides the rate by (number of steps) / 3,500, at most by 8. On a hash grid with --budget, it multiplies the
+    number of rays by the square of this factor."""
     average: float = 0.98
     """Decay per step of the averaged weights, which evaluations and pictures use; 0 is off. The decay is smaller in the
     first steps. Training itself uses the weights without averaging."""

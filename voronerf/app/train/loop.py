@@ -129,8 +129,6 @@ def prepare(state: State, callbacks: Sequence[Callback] = ()) -> None:
         done = strategy.step_pre_backward(optimizer, state.fraction, state.step)
         if done is not None:
             state.begin_stage(done)
-            if not strategy.inherit:  # the averages belong to the replaced networks
-                optimizer.drop_averages()
             for callback in callbacks:
                 callback.after_split(state, done)
     optimizer.set_learning_rate(state.learning_rate(), decay=state.relative_length)
@@ -144,7 +142,7 @@ def prepare(state: State, callbacks: Sequence[Callback] = ()) -> None:
 def count(state: State, steps: int, output: StepOutput) -> None:
     """Counts steps, and reads the output of the last step; on a GPU, reads it only every `READ_EVERY` steps."""
     state.count_steps(steps, output.rays)
-    if state.device.type == "cpu" or state.step % READ_EVERY == 0:
+    if state.device.type == "cpu" or (state.step - state.began) % READ_EVERY == 0:
         state.read_output(output)
 
 

@@ -18,6 +18,7 @@ from voronerf.app.train.state import State, TrainingStage
 from voronerf.diagram import VoronoiDiagram
 from voronerf.nerf.adam import parameter_groups
 from voronerf.nerf.samplers import SAMPLERS
+from voronerf.nerf.schedule import MOST_LENGTH
 from voronerf.router import VoronoiRouter
 
 #: The names of the counters, in a state and in a checkpoint.
@@ -141,7 +142,7 @@ def stored_values(checkpoint: Checkpoint) -> tuple[TrainConfig, Stored]:
         raise CheckpointError(str(error)) from None
     config = TrainConfig.from_values(stored.config, source)
     least = int(config.rays or 0)
-    most = int(least * config.field_type.ray_growth)
+    most = int(least * config.field_type.ray_growth * MOST_LENGTH**2)
     if not least <= stored.rays <= most:
         raise CheckpointError(f"{source}: rays must lie in {least} to {most} by its settings, got {stored.rays}")
     return config, stored

@@ -225,14 +225,16 @@ class State:
         self.loss, self.skipped_in_a_row = float(output.loss), int(self.guard.in_a_row)
         if self.sampler.grid is not None and (self.step - self.began) % schedule.GROUP == 0:
             more = self.relative_length**2 if self._has_table and self.config.budget is not None else 1.0
-            self.rays = next_rays(
+            least = int(self.config.rays or 0)
+            rays = next_rays(
                 self.rays,
                 output.samples,
-                rays=int((self.config.rays or 0) * more),
+                rays=int(least * more),
                 samples=self.sampler.strata,
                 growth=self.config.field_type.ray_growth,
                 contracted=self.config.contraction != "none",
             )
+            self.rays = min(rays, max(least, schedule.MOST_STRATA // self.sampler.strata))
 
     def count_evaluation(self, seconds: float, reserved: float) -> None:
         """Subtracts an evaluation's seconds from the budget, and sets the seconds reserved for the last evaluation."""

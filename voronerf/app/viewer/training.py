@@ -102,7 +102,8 @@ class Training(Callback):
 
     def tell(self) -> None:
         """Updates the training's status text and PSNR curve."""
-        self.told_at, now, metrics = time.perf_counter(), self.state, self.scores.metrics
+        self.told_at, now = time.perf_counter(), self.state
+        metrics = [line for line in self.scores.metrics if line["psnr"] is not None]  # None is infinite or NaN
         speed = now.rays_done / max(now.seconds, 1e-9) / 1000
         self.line.content = (
             f"step {now.step:,}, {now.seconds:.0f} s, {now.fraction:.0%}  \n"
