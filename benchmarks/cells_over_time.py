@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import statistics
 import tempfile
 import time
 from collections.abc import Sequence
@@ -106,17 +107,21 @@ def plot(path: Path, results: Sequence[dict[str, Any]]) -> None:
     scenes = list(dict.fromkeys(row["scene"] for row in results))
     figure, panes = pyplot.subplots(1, len(scenes), figsize=(5 * len(scenes), 3.8), layout="constrained", squeeze=False)
     for scene, pane in zip(scenes, panes[0]):
-        for side in SIDES:
+        for color, side in enumerate(SIDES):
             rows = [row for row in results if (row["scene"], row["side"]) == (scene, side)]
+            if not rows:
+                continue
             times = sorted({row["minutes"] for row in rows})
             scores = [[row["psnr"] for row in rows if row["minutes"] == minutes] for minutes in times]
-            line = pane.plot(times, [sum(values) / len(values) for values in scores], "o-", markersize=3, label=side)[0]
-            pane.fill_between(times, list(map(min, scores)), list(map(max, scores)), color=line.get_color(), alpha=0.2)
+            picture = statistics.median(row["picture_ms"] for row in rows if row["minutes"] == times[-1])
+            style: dict[str, Any] = {"color": f"C{color}", "label": f"{side}, {picture:.0f} ms"}
+            pane.plot(times, list(map(statistics.mean, scores)), "o-", markersize=3, **style)
+            pane.fill_between(times, list(map(min, scores)), list(map(max, scores)), color=f"C{color}", alpha=0.2)
         pane.set(title=scene, xscale="log", xlabel="minutes of one thread", ylabel="test PSNR [dB]")
         pane.set_xticks(times := sorted({row["minutes"] for row in results}), [f"{minutes:g}" for minutes in times])
         pane.minorticks_off()
         pane.grid(alpha=0.3)
-    panes[0][-1].legend(fontsize=8)
+        pane.legend(fontsize=7, title="and time of a picture at the end", title_fontsize=7)
     figure.savefig(path, dpi=110)
 
 
