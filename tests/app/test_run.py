@@ -41,6 +41,7 @@ def test_a_run_is_what_was_trained(folder, scene) -> None:
     assert {name: scores[name] for name in ("psnr", "ssim")} == {name: summary[name] for name in ("psnr", "ssim")}
     assert [view["name"] for view in scores["views"]] == list(scene.test.names)
     assert len(run.evaluate(views=2, lpips="off")["views"]) == 2
+    refuses("views must be at least 1, got 0", run.evaluate, views=0, lpips="off", error=ConfigError)
 
 
 def test_any_camera_is_rendered(folder, scene) -> None:

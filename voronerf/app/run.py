@@ -130,6 +130,8 @@ class Run:
             "far_views", and "views", a list with the values of a :class:`voronerf.app.evaluate.ViewScore` for each
             view.
         """
+        if views is not None and views < 1:
+            raise ConfigError(f"views must be at least 1, got {views}")
         if not isinstance(lpips, Lpips):
             lpips = self.find_lpips(lpips)
         scores = evaluate(self.renderer, self.scene, views=views, lpips=lpips, track=track)

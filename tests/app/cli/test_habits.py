@@ -45,6 +45,14 @@ def test_runs_are_compared(tmp_path, capsys):
     assert not any(row[0] in ("width", "out") for row in rows if row) and any(row[:1] == ["cells"] for row in rows)
 
 
+def test_a_run_that_was_stopped_before_its_scores_shows_those_of_eval(tmp_path, capsys):
+    runs = make_run(tmp_path / "a", None, [16]), make_run(tmp_path / "b", None, [16])
+    (runs[0] / "eval.json").write_text(json.dumps({"psnr": 20.25, "ssim": 0.5, "lpips": None, "views": [1, 2]}))
+    assert main(words("compare", *runs)) == 0
+    out = capsys.readouterr().out
+    assert "20.25" in out and f"{runs[1]} has no scores" in out and f"{runs[0]} has no scores" not in out
+
+
 def test_numbers_are_compared_as_people_write_them(tmp_path, capsys):
     short, long = make_run(tmp_path / "short", 30.125, [16]), make_run(tmp_path / "long", 27.5, [4, 4])
     summaries = {"seconds": 4.6075, "steps": 1234}, {"seconds": 479.8, "steps": 99}

@@ -86,7 +86,8 @@ def test_depths_of_more_pixels_than_torch_takes_quantiles_of(monkeypatch):
 def test_a_video_that_ffmpeg_did_not_finish(tmp_path, monkeypatch):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     frames = (torch.rand(3, 16, 16, 3) * 255).to(torch.uint8)
-    path = tmp_path / "turn.mp4"
+    monkeypatch.chdir(tmp_path)
+    path = Path("turn:1.mp4")  # for ffmpeg, the colon of a relative path ends a protocol
     write_video(path, frames, 10)
     before = path.read_bytes()
     write_frames = imageio_ffmpeg.write_frames

@@ -20,7 +20,7 @@ from voronerf.app.evaluate.panels import palette
 from voronerf.app.evaluate.scores import in_silence
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
 from voronerf.app.export.mesh import REACH, _fused
-from voronerf.app.export.space import SurfaceView, views_of, write_geometry
+from voronerf.app.export.space import SurfaceView, placed, views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
@@ -320,6 +320,12 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
     refuses(rule, export_mesh, run, path, resolution=7, error=ConfigError)
     refuses(rule, export_mesh, run, path, resolution=10**6, error=ConfigError)
     refuses("--faces must be at least 4, got 0", export_mesh, run, path, faces=0, error=ConfigError)
+    folder = path.with_name("folder.ply")
+    folder.mkdir()
+    refuses("folder.ply: must be a file, got a folder", export_mesh, run, folder)
+    folder.rmdir()
+    joined = replace(run, scene=replace(run.scene, kind="unbounded", transform=None))
+    refuses("--coordinates must be scene", placed, joined, None, True, error=ConfigError)
     unbounded = replace(run, scene=replace(run.scene, box=None))
     refuses("--crop must be given", export_points, unbounded, path, error=ConfigError)
     for export in (export_points, export_mesh):

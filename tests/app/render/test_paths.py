@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import all_pairs, read_json, refuses
 
+from voronerf.app.export.video import video_cameras
 from voronerf.app.render.paths import (
     CameraPath,
     capture_path,
@@ -310,6 +311,16 @@ def test_frames_have_the_size_of_most_images_or_another():
     assert resized(wide, (32, 24)).intrinsics[0].tolist() == pytest.approx([160 / 3, 160 / 3, 16, 12])
     around = resized(replace(frames, distortion=torch.zeros(5, 8), models=torch.ones(5, dtype=torch.int32)), (128, 72))
     assert around.models.tolist() == [1] * 5 and torch.equal(around.intrinsics, wide.intrinsics)  # still fisheye
+
+
+def test_a_turntable_has_the_size_and_the_lens_of_most_images():
+    scene, options = builtin_scene(8), {"radius": 4.0, "elevation": 20.0}
+    small = orbit_cameras(2, width=100, height=100, focal=120, **options)
+    large = orbit_cameras(4, width=400, height=400, focal=480, **options)
+    sizes = torch.tensor([[100, 100]] * 2 + [[400, 400]] * 4)
+    both = (torch.cat(pair) for pair in ((small.poses, large.poses), (small.intrinsics, large.intrinsics)))
+    cameras = video_cameras(replace(scene, train=replace(scene.train, cameras=Cameras.of_images(*both, sizes))), 3)
+    assert (cameras.width, cameras.height) == (400, 400) and cameras.intrinsics[0, 0] == 480
 
 
 @pytest.mark.parametrize("towards", [0.0, 4.0])  # parallel, or aimed at a point

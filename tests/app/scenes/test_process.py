@@ -615,11 +615,11 @@ def test_converted_images_are_upright_and_keep_their_lens(tmp_path, name, option
     assert camera.has_prior_focal_length == ("exif" in options)
 
 
-@pytest.mark.parametrize("name", ["a.tif", "a.webp"])
+@pytest.mark.parametrize("name", ["a.tif", "a.webp", "a.jpg"])
 def test_transparent_images_stay_transparent(tmp_path, name):
     image = picture(3, mode="RGBA")
     image.putalpha(77)
-    image.save(tmp_path / name)
+    image.save(tmp_path / name, format="PNG" if name == "a.jpg" else None)
     copy, _ = gather._copy_image(tmp_path / name, tmp_path / f"copy_{name}")
     with Image.open(copy) as kept:
         assert copy.suffix == ".png" and kept.mode == "RGBA" and kept.getpixel((4, 4))[3] == 77

@@ -142,6 +142,9 @@ def test_a_picture_of_another_split_is_not_taken(tmp_path, start):
     assert scene.test.names == ("r_0", "r_8") and len(scene.train) == 7
     rewrite(tmp_path, lambda contents: [frame.update(time=0.25) for frame in contents["frames"]], "transforms_train")
     assert not any("times" in note for note in load_scene(tmp_path).notes)
+    (tmp_path / "m.png").touch()
+    rewrite(tmp_path, lambda contents: contents["frames"][3].update(mask_path="m.png"), "transforms_train")
+    assert "its masks are not used, only the alpha channel" in load_scene(tmp_path).notes
     marked = {"encoding": "utf-8-sig"}  # with a byte order mark
     rewrite(tmp_path, lambda contents: contents["frames"][3].update(time=0.5), "transforms_train", **marked)
     assert "its times are not used: the scene is taken as still" in load_scene(tmp_path).notes

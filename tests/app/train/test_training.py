@@ -85,6 +85,14 @@ def test_the_middle_of_a_view_is_that_of_the_whole_view(scene):
         assert score.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-5)
 
 
+def test_the_middle_of_a_view_lies_where_the_mask_shows_something(scene):
+    masks = torch.ones(len(scene.test), 16, 16, dtype=torch.bool)
+    masks[0, :, :14] = False  # the middle of 5 x 5 pixels is hidden
+    state = started(replace(scene, test=replace(scene.test, masks=masks)), 1)
+    (score,) = evaluate(state.renderer, state.scene, views=[0], middle=3)
+    assert math.isfinite(score.psnr)
+
+
 def test_no_collapse_to_white(scene):
     """The opacity does not collapse to 0; every ray would then be white and have no gradient."""
     state = started(scene, 100, steps=100, rays=256, samples=(24,), width=32, cells=())

@@ -59,7 +59,7 @@ def compare(runs: tuple[Path, ...], /) -> int:
             table.add_row(escape(printable(name)), *values)
     console.print(table)
     for run, (figures, _) in zip(runs, read, strict=True):
-        if "psnr" not in figures:
+        if figures.get("psnr") is None:
             say(f"{run} has no scores: {shlex.join(['voronerf', 'eval', str(run)])} computes them")
     return 0
 
@@ -81,7 +81,7 @@ def read_files(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     scores = read_json(run / "eval.json", dict) if (run / "eval.json").is_file() else {}
     if not figures and has_parts(run):
         figures = count_parts(run)
-    if "psnr" not in figures and isinstance(views := scores.get("views"), list):
+    if figures.get("psnr") is None and isinstance(views := scores.get("views"), list):
         figures |= {**scores, "views": len(views)}
     options = settings.pop("field_options", [])
     return figures, settings | dict(parse_option(str(text)) for text in (options if isinstance(options, list) else []))

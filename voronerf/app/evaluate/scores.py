@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from voronerf.app.evaluate.angles import FAR_ANGLE, nearest_angle
 from voronerf.app.evaluate.lpips import Lpips
@@ -90,11 +91,11 @@ def evaluate(
     for view in track(chosen, "scores"):
         if scores and stop is not None and stop():
             break
-        camera, rows, columns = _middle_of(scene.test.cameras, view, middle)
+        mask = scene.test.mask(view)
+        camera, rows, columns = _middle_of(scene.test.cameras, view, middle, mask)
         image = render_camera(renderer, scene, camera, 0, heaviest=False)
         target = scene.test.truth(view, scene.background_colour())[rows, columns].to(renderer.device)
         colour = image.colour.clamp(0, 1)
-        mask = scene.test.mask(view)
         if mask is None:
             noise = psnr(colour, target)
         else:
@@ -107,14 +108,19 @@ def evaluate(
     return scores
 
 
-def _middle_of(cameras: Cameras, view: int, factor: int) -> tuple[Cameras, slice, slice]:
+def _middle_of(cameras: Cameras, view: int, factor: int, mask: Tensor | None) -> tuple[Cameras, slice, slice]:
     """Returns a camera for the central part of a view, and the rows and columns of this part in the view.
 
-    The part has the width and height of the view, both divided by `factor`.
+    The part has the width and height of the view, both divided by `factor`. If the mask hides all of it, it lies around
+    the visible pixel that is closest to the centre.
     """
     (width, height), camera = cameras.size(view), cameras[[view]]
     part = max(width // factor, 1), max(height // factor, 1)
     left, top = (width - part[0]) // 2, (height - part[1]) // 2
+    if mask is not None and not mask[top : top + part[1], left : left + part[0]].any():
+        pixels = mask.nonzero()
+        y, x = pixels[(pixels - torch.tensor([height // 2, width // 2])).square().sum(1).argmin()].tolist()
+        left, top = min(max(x - part[0] // 2, 0), width - part[0]), min(max(y - part[1] // 2, 0), height - part[1])
     camera = crop_camera(camera, left, top, *part) if factor > 1 else camera
     return camera, slice(top, top + part[1]), slice(left, left + part[0])
 

@@ -48,6 +48,8 @@ def check_export(path: Path, suffixes: tuple[str, ...]) -> None:
         except ImportError:
             raise ImportError(f"an export needs {package}: pip install 'voronerf[export]'") from None
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise ValueError(f"{path}: must be a file, got a folder")
 
 
 def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
@@ -64,6 +66,8 @@ def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
 
 def placed(run: Run, geometry: Any, to_files: bool) -> Any:
     """Returns a mesh or points of trimesh, moved into the coordinates of the scene's files if ``to_files``."""
+    if to_files and run.scene.transform is None and run.scene.kind != "object":
+        raise ConfigError("--coordinates must be scene: the run is joined from several, got files")
     if to_files and run.scene.transform is not None:
         geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
     return geometry

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from voronerf.app.evaluate.panels import SOLID, picture_of_colour, picture_of_depth, save_picture
 from voronerf.app.export.space import Track, in_silence
-from voronerf.app.render.paths import capture_path, evenly_spaced
+from voronerf.app.render.paths import capture_path, evenly_spaced, like_most
 from voronerf.app.render.video import write_video
 from voronerf.app.run import Run
 from voronerf.app.scenes import Scene
@@ -81,7 +81,7 @@ def video_cameras(scene: Scene, count: int) -> Cameras:
     """
     cameras = scene.train.cameras
     if scene.kind == "object":
-        return turntable_cameras(cameras, count)
+        return turntable_cameras(like_most(cameras), count)
     return capture_path(cameras, count, near=scene.near, far=scene.far)
 
 

@@ -27,6 +27,8 @@ def check_video(path: Path) -> None:
     except (ImportError, RuntimeError):
         raise ImportError("writing a video needs imageio-ffmpeg and its ffmpeg: pip install imageio-ffmpeg") from None
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise ValueError(f"{path}: must be a file, got a folder")
     partial = _partial(path)
     partial.unlink(missing_ok=True)  # else touch would follow a link
     partial.touch()
@@ -34,7 +36,7 @@ def check_video(path: Path) -> None:
 
 
 def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    return path.absolute().with_name(f".{path.stem}.{os.getpid()}{path.suffix}")  # ffmpeg reads `a:b.mp4` as a protocol
 
 
 def write_video(path: Path, frames: Iterable[Tensor], fps: float) -> None:

@@ -78,7 +78,9 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
-    notes = ("Blender scene, an object on white", *notes, *time_notes((*train_frames, *test_frames)))
+    frames = [*train_frames, *test_frames]
+    masks = ("its masks are not used, only the alpha channel",) * any(frame.mask for frame in frames)
+    notes = ("Blender scene, an object on white", *notes, *time_notes(frames), *masks)
     name = folder.resolve().name
     return Scene(name=name, train=train, test=test, near=near, far=far, box=box, background="white", notes=notes)
 

@@ -228,7 +228,8 @@ def _copy_image(path: Path, copy: Path) -> tuple[Path, bool]:
             deep = is_deep(image)
             if image.format in COPIED and not deep:
                 read_image(path, min(8, *read_header(path).size))  # refuses truncated files, which COLMAP accepts
-                copy = copy.with_suffix(".jpg") if copy.suffix.lower() == ".jfif" else copy
+                suffixes = (".png",) if image.format == "PNG" else (".jpg", ".jpeg")
+                copy = copy if copy.suffix.lower() in suffixes else copy.with_suffix(suffixes[0])
                 shutil.copyfile(path, copy)
                 return copy, deep
             check_grey(image, path)
@@ -473,7 +474,7 @@ def _write_frames(video: Video, folder: Path, count: int, prefix: str) -> int:
     """
     passed = ["-fps_mode", "passthrough"]
     deinterlaced = "bwdif=send_frame:deint=interlaced," * video.interlaced
-    pattern = str(folder / prefix).replace("%", "%%") + ("" if prefix else os.sep) + "%05d.jpg"
+    pattern = str(folder.absolute() / prefix).replace("%", "%%") + ("" if prefix else os.sep) + "%05d.jpg"
 
     def take(total: int) -> int:
         """Writes frames, assuming that the video has `total` frames, and returns the actual number."""
