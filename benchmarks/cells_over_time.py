@@ -98,14 +98,17 @@ def train(data: str, minutes: float, seed: int, sides: Sequence[str], views: int
 
 
 def plot(path: Path, results: Sequence[dict[str, Any]]) -> None:
-    """Draws the PSNR of all sides by the length of the training, one pane for each scene; a band spans the seeds."""
+    """Draws the PSNR of all sides by the length of the training, one pane for each scene; a band spans the seeds.
+
+    The legend has the time of a picture after the longest training.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
     scenes = list(dict.fromkeys(row["scene"] for row in results))
-    figure, panes = pyplot.subplots(1, len(scenes), figsize=(5 * len(scenes), 3.8), layout="constrained", squeeze=False)
+    figure, panes = pyplot.subplots(1, len(scenes), figsize=(5 * len(scenes), 4.6), layout="constrained", squeeze=False)
     for scene, pane in zip(scenes, panes[0]):
         for color, side in enumerate(SIDES):
             rows = [row for row in results if (row["scene"], row["side"]) == (scene, side)]
@@ -114,14 +117,14 @@ def plot(path: Path, results: Sequence[dict[str, Any]]) -> None:
             times = sorted({row["minutes"] for row in rows})
             scores = [[row["psnr"] for row in rows if row["minutes"] == minutes] for minutes in times]
             picture = statistics.median(row["picture_ms"] for row in rows if row["minutes"] == times[-1])
-            style: dict[str, Any] = {"color": f"C{color}", "label": f"{side}, {picture:.0f} ms"}
+            style: dict[str, Any] = {"color": f"C{color}", "label": f"{side}, {picture:.0f} ms a picture"}
             pane.plot(times, list(map(statistics.mean, scores)), "o-", markersize=3, **style)
             pane.fill_between(times, list(map(min, scores)), list(map(max, scores)), color=f"C{color}", alpha=0.2)
         pane.set(title=scene, xscale="log", xlabel="minutes of one thread", ylabel="test PSNR [dB]")
         pane.set_xticks(times := sorted({row["minutes"] for row in results}), [f"{minutes:g}" for minutes in times])
         pane.minorticks_off()
         pane.grid(alpha=0.3)
-        pane.legend(fontsize=7, title="and time of a picture at the end", title_fontsize=7)
+        pane.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), frameon=False)
     figure.savefig(path, dpi=110)
 
 
