@@ -119,7 +119,7 @@ def _middle_of(cameras: Cameras, view: int, factor: int, mask: Tensor | None) ->
     left, top = (width - part[0]) // 2, (height - part[1]) // 2
     if mask is not None and not mask[top : top + part[1], left : left + part[0]].any():
         pixels = mask.nonzero()
-        y, x = pixels[(pixels - torch.tensor([height // 2, width // 2])).square().sum(1).argmin()].tolist()
+        y, x = pixels[(pixels - pixels.new_tensor([height // 2, width // 2])).square().sum(1).argmin()].tolist()
         left, top = min(max(x - part[0] // 2, 0), width - part[0]), min(max(y - part[1] // 2, 0), height - part[1])
     camera = crop_camera(camera, left, top, *part) if factor > 1 else camera
     return camera, slice(top, top + part[1]), slice(left, left + part[0])
