@@ -210,3 +210,20 @@ def test_memory_that_was_freed_is_refused() -> None:
     router.module.a.weight.untyped_storage().resize_(0)
     with pytest.raises((TypeError, RuntimeError)):
         router(X)
+
+
+def test_the_gradient_of_the_deviation_of_equal_features_is_0() -> None:
+    class Normalised(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 8, bias=False)
+
+        def forward(self, x: Tensor) -> Tensor:
+            h = self.layer(x)
+            return h / (h.std(-1, keepdim=True) + 1)
+
+    router, x = VoronoiRouter(Normalised(), 2, fuse=True), torch.rand(40, 3)
+    router(x, cells=torch.arange(40) % 2)
+    x[0] = 0
+    router(x, cells=torch.arange(40) % 2).sum().backward()
+    assert router.explain() == "forward: fused" and router.module.layer.weight.grad.isfinite().all()

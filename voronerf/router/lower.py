@@ -127,8 +127,12 @@ def _norm(x: Tensor, order: float = 2, dim: Any = None, keepdim: bool = False, *
         return x.abs().sum(dim, keepdim=keepdim)
     if order != 2:
         raise NotAStep(f"a norm of order {order}")
-    squares = x.square().sum(dim, keepdim=keepdim)  # at 0 the gradient is 0, while the gradient of the root is infinite
-    return torch.where(squares > 0, torch.where(squares > 0, squares, 1.0).sqrt(), 0.0)
+    return _root(x.square().sum(dim, keepdim=keepdim))
+
+
+def _root(x: Tensor) -> Tensor:
+    """Returns the square root, whose gradient at 0 is 0 instead of infinite."""
+    return torch.where(x > 0, torch.where(x > 0, x, 1.0).sqrt(), 0.0)
 
 
 def _variance(x: Tensor, dim: Any = None, correction: float | None = None, keepdim: bool = False) -> Tensor:
@@ -238,7 +242,7 @@ _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "any": lambda x, dim=None, keepdim=False: ~_reduced(torch.bitwise_and, ~x, dim, keepdim),
     "mean": _mean,
     "var": _variance,
-    "std": lambda *args, **kwargs: _variance(*args, **kwargs).sqrt(),
+    "std": lambda *args, **kwargs: _root(_variance(*args, **kwargs)),
     "linalg_vector_norm": _norm,
     "native_layer_norm": _layer_norm,
     "native_group_norm": _group_norm,
