@@ -5,6 +5,7 @@ from __future__ import annotations
 import types
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -210,6 +211,51 @@ def test_memory_that_was_freed_is_refused() -> None:
     router.module.a.weight.untyped_storage().resize_(0)
     with pytest.raises((TypeError, RuntimeError)):
         router(X)
+
+
+class Encoder:
+    """An encoder of a NeRF codebase: a callable object that is no module."""
+
+    def __init__(self) -> None:
+        self.alpha = 1.0
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return x + self.alpha * torch.sin(4 * x)
+
+
+class Deep(nn.Module):
+    """A module whose forward reads a number that its attribute holds several levels deep."""
+
+    def __init__(self, held: Any, read: Callable[[Any, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.layer, self.held, self.read = nn.Linear(3, 2), held, read
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layer(self.read(self.held, x))
+
+
+@pytest.mark.parametrize(
+    ("held", "read", "change"),
+    [
+        (Encoder(), lambda held, x: held(x), lambda held: setattr(held, "alpha", 0.0)),
+        (Encoder().__call__, lambda held, x: held(x), lambda held: setattr(held.__self__, "alpha", 0.0)),
+        (partial(torch.mul, other=2.0), lambda held, x: held(x), lambda held: held.keywords.update(other=0.5)),
+        ({"a": {"b": 2.0}}, lambda held, x: held["a"]["b"] * x, lambda held: held["a"].update(b=0.5)),
+        ([[2.0]], lambda held, x: held[0][0] * x, lambda held: held[0].__setitem__(0, 0.5)),
+        (types.SimpleNamespace(a=[torch.ones(1)]), lambda held, x: held.a[0] * x, lambda held: held.a[0].mul_(3)),
+        (torch.distributions.Normal(0, 2), lambda held, x: held.scale * x, lambda held: setattr(held, "scale", 0.5)),
+    ],
+    ids=["object", "method", "partial", "dicts", "lists", "tensor", "library"],
+)
+def test_numbers_deep_in_an_attribute_are_followed(held: Any, read: Any, change: Any) -> None:
+    router, x = VoronoiRouter(Deep(held, read), 2, fuse=True), torch.rand(40, 3)
+    cells = torch.arange(40) % 2
+    before = router(x, cells=cells)
+    change(router.module.held)
+    after = router(x, cells=cells)
+    expected = torch.stack([router.cell(int(cell))(row) for cell, row in zip(cells, x, strict=True)])
+    assert router.explain() == "forward: fused" and not torch.allclose(before, after)
+    torch.testing.assert_close(after, expected)
 
 
 def test_the_gradient_of_the_deviation_of_equal_features_is_0() -> None:

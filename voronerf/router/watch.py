@@ -6,9 +6,12 @@ A trace stores their values. Each call compares the stored values with the curre
 
 from __future__ import annotations
 
+import sys
+from argparse import Namespace
 from dataclasses import dataclass
+from functools import partial
 from numbers import Number
-from types import FunctionType
+from types import FunctionType, MethodType, SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -31,6 +34,10 @@ _DICTIONARIES = frozenset({"_modules", *HOOKS})  # dictionaries of every module,
 _UNWATCHED = frozenset(vars(nn.Module())) - {"training", *_DICTIONARIES}
 _OF_CLASSES = (bool, int, float, str, FunctionType)  # types of class attributes that a module's attribute may override
 _MISSING: Any = object()
+MOST = 64  # maximum number of watched containers in an attribute
+_LIBRARIES = sys.stdlib_module_names | {"torch", "numpy"}
+_CONTAINERS = (dict, list, tuple, set, frozenset)
+_PLAIN = (*_CONTAINERS, SimpleNamespace, Namespace)
 
 
 @dataclass(frozen=True)
@@ -64,21 +71,21 @@ class _Seen(NamedTuple):
         source: The place of the value in the module.
         registry: The dictionary that holds the current value under the source's name.
         value: The value.
-        container: The value if it is a container, or the attributes of a plain object; None for other values.
-        items: The items of the container.
+        containers: The containers and the attributes of plain objects that the value is or holds, see `_containers`.
+        items: The items of the containers.
         tensors: The values of the tensors among the value and its items.
     """
 
     source: tuple[int, str]
     registry: dict[str, Any]
     value: Any
-    container: Any
+    containers: tuple[Any, ...]
     items: tuple[Any, ...]
     tensors: list[Values]
 
     def changed(self) -> bool:
         """Returns whether the current value differs from the seen value."""
-        items, value = _items(self.container), self.registry.get(self.source[1], _MISSING)
+        items, value = _items(self.containers), self.registry.get(self.source[1], _MISSING)
         is_same = same(value, self.value) and len(items) == len(self.items) and all(map(same, items, self.items))
         return not is_same or any(tensor.changed() for tensor in self.tensors)
 
@@ -88,8 +95,8 @@ class _Seen(NamedTuple):
             dependencies.entries(self.registry, [self.source[1]])
         for tensor in self.tensors:
             tensor.note(dependencies)
-        if self.container is not None:
-            dependencies.contents(self.container)
+        for container in self.containers:
+            dependencies.contents(container)
 
 
 class Watch:
@@ -112,9 +119,9 @@ class Watch:
             value = registry.get(name, _MISSING)
             if value is _MISSING and not isinstance(getattr(type(part), name, None), _OF_CLASSES):
                 continue  # a property, or no attribute
-            items = _items(container := _container(value))
+            items = _items(containers := _containers(value))
             tensors = [Values(item) for item in (value, *items) if isinstance(item, Tensor)]
-            self._seen.append(_Seen((place, name), registry, value, container, items, tensors))
+            self._seen.append(_Seen((place, name), registry, value, containers, items, tensors))
 
     def value(self, source: Source) -> Any:
         """Returns the value that the trace read from a source; None if it did not read the source."""
@@ -147,17 +154,28 @@ def module_dependencies(module: nn.Module) -> Any:
     return dependencies
 
 
-def _container(value: Any) -> Any:
-    """Returns a container itself, the attributes of a plain object, or None for other values."""
-    if isinstance(value, (dict, list, tuple, set, frozenset)):
-        return value
-    other = isinstance(value, (Tensor, nn.Module, type)) or callable(value) or not hasattr(value, "__dict__")
-    return None if other else vars(value)
+def _containers(value: Any) -> tuple[Any, ...]:
+    """Returns the containers and the attributes of plain objects that a value is or holds, at most `MOST`.
+
+    Plain objects may be callable, such as an encoder; a bound method is its object, and a partial function its
+    keywords. Objects of libraries, such as a logger, are not looked into.
+    """
+    pending, found = [value], dict[int, Any]()
+    while pending and len(found) < MOST:
+        item = pending.pop(0)
+        item = item.__self__ if isinstance(item, MethodType) else item.keywords if isinstance(item, partial) else item
+        of_library = type(item).__module__.partition(".")[0] in _LIBRARIES and not isinstance(item, _PLAIN)
+        opaque = isinstance(item, (Tensor, nn.Module, type)) or (of_library and callable(item))
+        container = item if isinstance(item, _CONTAINERS) else None if opaque else getattr(item, "__dict__", None)
+        if container is not None and id(container) not in found:
+            found[id(container)] = container
+            pending += () if of_library else _items((container,))
+    return tuple(found.values())
 
 
-def _items(container: Any) -> tuple[Any, ...]:
-    """Returns the items of a container, one level deep."""
-    return (*container, *container.values()) if isinstance(container, dict) else tuple(container or ())
+def _items(containers: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Returns the items of containers, and the keys of dictionaries."""
+    return tuple(item for each in containers for item in (*each, *(each.values() if isinstance(each, dict) else ())))
 
 
 def same(a: Any, b: Any) -> bool:
