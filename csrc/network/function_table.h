@@ -14,6 +14,8 @@
   DO(abs, abs(x), positive(x, one, x < zero ? zero - one : zero), zero, zero)                                         \
   DO(clamp, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x, x >= splat(a) ? (x <= splat(b) ? one : zero) : zero,  \
      zero, zero)                                                                                                      \
+  DO(hardtanh, x<splat(a) ? splat(a) : x> splat(b) ? splat(b) : x,                                                    \
+     x <= splat(a) ? zero : (x >= splat(b) ? zero : one), zero, zero)                                                 \
   DO(elu, positive(x, x, splat(a) * exponential_minus_one(x)), positive(x, one, splat(a) * any_exponential(x)),       \
      x >= zero ? zero : splat(a) * any_exponential(x), x >= zero ? zero : splat(a) * any_exponential(x))              \
   DO(softplus, splat(a) * x > splat(b) ? x : softplus(splat(a) * x) * splat(1.0f / a),                                \
@@ -32,6 +34,10 @@
      splat(-a * a) * any_sine(fma(splat(a), x, splat(b)), false),                                                     \
      splat(-a * a * a) * any_sine(fma(splat(a), x, splat(b)), true))                                                  \
   DO(exp, any_exponential(x), any_exponential(x), any_exponential(x), any_exponential(x))                             \
+  DO(expm1, x < one ? exponential_minus_one(x) : any_exponential(x) - one, any_exponential(x), any_exponential(x),    \
+     any_exponential(x))                                                                                              \
+  DO(log1p, logarithm_of_one_plus(x), one / (one + x), zero - one / ((one + x) * (one + x)),                          \
+     splat(2.0f) / ((one + x) * (one + x) * (one + x)))                                                               \
   DO(log, logarithm(x), one / x, zero - one / (x * x), splat(2.0f) / (x * x * x))                                     \
   DO(power, raised(x, a, 0), raised(x, a - 1.0f, 1), raised(x, a - 2.0f, 2), raised(x, a - 3.0f, 3))                  \
   DO(erf, error_function(x), splat(2.82842712f) * density(splat(1.41421356f) * x),                                    \

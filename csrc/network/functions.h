@@ -34,6 +34,13 @@ VN_INLINE F32 raised(F32 x, float p, int order) {
   return splat(factor) * (p < 0.0f ? splat(1.0f) / result : result);
 }
 
+// Returns log(1 + x). Around 0, the factor x / ((1 + x) - 1) corrects the rounding of 1 + x (Kahan).
+VN_INLINE F32 logarithm_of_one_plus(F32 x) {
+  const F32 one = splat(1.0f), sum = one + x, rounded = sum - one;
+  const F32 near = rounded == splat(0.0f) ? x : logarithm(sum) * (x / rounded);
+  return x < one ? near : logarithm(sum);
+}
+
 VN_INLINE F32 hyperbolic_tangent(F32 x) {
   const F32 t = exponential_minus_one(splat(-2.0f) * abs(x)), size = splat(0.0f) - t / (t + splat(2.0f));
   return x < splat(0.0f) ? splat(0.0f) - size : size;

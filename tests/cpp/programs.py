@@ -25,7 +25,7 @@ compiled = native.compiled
 WIDTHS = (1, 3, 4, 5, 15, 16, 17, 33, 48, 63, 64, 65, 90, 129, 130)
 CONVENTIONS = ("tiny-cuda-nn", "torch-ngp", "nerfstudio")
 JUMPS = ("step", "at_least", "floor")  # applied to inputs only, which are equal for all instruction sets
-POSITIVE = ("log", "power")
+POSITIVE = ("log", "log1p", "power")
 
 
 def grid(draw: random.Random) -> HashGrid:
@@ -110,7 +110,7 @@ def any_steps(draw: random.Random) -> Program:
             x = b.apply("tanh", some(width))
             if name in POSITIVE:
                 x = b.apply("affine", x, 0.5, 1.0)
-            numbers = (-0.5, 0.5) if name == "clamp" else (draw.choice((0.5, 2.0)), draw.choice((0.0, 1.0)))
+            numbers = (-0.5, 0.5) if name in ("clamp", "hardtanh") else (draw.choice((0.5, 2.0)), draw.choice((0.0, 1.0)))
             return b.apply(name, x, *numbers)
         if kind == "jump":
             x = draw.choice(inputs)

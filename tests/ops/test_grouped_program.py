@@ -26,6 +26,7 @@ from voronerf.ops.network import native as plans
 from voronerf.ops.network.reference import cells_of
 
 NUMBERS = {"softplus": (3.0, 20.0), "sine": (1.7, 0.3), "clamp": (-0.5, 0.6), "power": (1.5, 0.0), "affine": (2.0, 1.0)}
+NUMBERS["hardtanh"] = NUMBERS["clamp"]
 SIZES = ([0], [1], [5, 0, 24], [96, 1], [97, 0, 3], [0, 95, 200, 23])
 
 
@@ -114,7 +115,7 @@ def test_derivative_of_every_function(name: str, order: int) -> None:
     program = b.program([columns])
     generator = torch.Generator().manual_seed(1)
     rows = 3 * torch.randn(101, 19, generator=generator, dtype=torch.float64)
-    rows = rows.abs() + 0.1 if name in ("log", "power") else rows
+    rows = rows.abs() + 0.1 if name in ("log", "log1p", "power") else rows
     offsets = offsets_of([40, 61])
     (exact,) = grouped_program([rows], [], offsets, program=program, backend="reference")
     (ours,) = grouped_program([rows.float()], [], offsets, program=program, backend="native")
@@ -125,7 +126,9 @@ FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38
 SPECIAL = [
     *((name, (1.0, 20.0), FAR) for name in ("exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu")),
     *((name, (1.0, 20.0), FAR) for name in ("relu", "abs", "erf", "atan")),
-    ("clamp", (-1.0, 10.0), [*FAR, float("nan")]),
+    *((name, (-1.0, 10.0), [*FAR, float("nan")]) for name in ("clamp", "hardtanh")),
+    ("expm1", (0.0, 0.0), [x for x in FAR if x < 80]),
+    ("log1p", (0.0, 0.0), [*(x for x in FAR if x > -1), 1e-7, -1e-7, float("inf")]),
     *(("power", (p,), [0.001, 0.3, 1.0, 1.5, 2.7, 0.0, -1.5]) for p in (0.3, -1.25, 2.4, 1 / 3, 5.0, -3.5, 70.0)),
 ]
 """Functions, their numbers, and arguments: very small and very large ones, 0, and the places of kinks. Powers may be

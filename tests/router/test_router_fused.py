@@ -118,6 +118,48 @@ def test_a_step_of_the_program(name: str) -> None:
     equal(actual, expected, x, router, twice=name not in ONCE)
 
 
+SPECIAL: dict[str, Callable[[Tensor], Tensor]] = {
+    "infinite": lambda x: x.relu() + ((1 / x).abs() == torch.inf),
+    "not a number": lambda x: x.relu() + (x / x.abs() != x / x.abs()),
+    "finite": lambda x: torch.where(torch.isfinite(1 / x), x, 0.0),
+    "at least infinity": lambda x: x.relu() + (1 / x >= torch.inf) + (1 / x > -torch.inf),
+    "at most infinity": lambda x: x.relu() + (1 / x <= -torch.inf) + (1 / x < torch.inf),
+    "equal infinities": lambda x: x.relu() + (1 / x == 1 / x.abs()),
+    "one bound": lambda x: (1 / x).clamp(min=0.5) + (1 / x).clamp(max=0.5),
+    "relu6": lambda x: F.relu6(6 * x),
+    "hardtanh": F.hardtanh,
+    "amax": lambda x: x.amax(-1),
+    "amin": lambda x: x.amin(-1, keepdim=True),
+    "std": lambda x: x / (x.std(-1, keepdim=True) + 1),
+    "expm1": lambda x: 1e8 * torch.expm1(1e-8 * x),
+    "log1p": lambda x: 1e8 * torch.log1p(1e-8 * x),
+    "a masked softmax": lambda x: x.masked_fill(x < 0.5, -torch.inf).softmax(-1),
+}
+"""Functions whose values or gradients are special at infinities, bounds, equal entries or small numbers."""
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_special_numbers_of_a_step(name: str) -> None:
+    class Scaled(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.gain = nn.Parameter(torch.ones(3))
+
+        def forward(self, x: Tensor) -> Tensor:
+            return SPECIAL[name](self.gain * x)
+
+    rows = [[0, 1, -1], [1, 1, 1], [-1, -1, 0], [0.5, 2, 0.25], [1, 1, 0.3], [-0.0, 0.6, 0.9], [3, 3, 3], [0, 0, 1]]
+    module, results = Scaled(), []
+    router = VoronoiRouter(module, 2, fuse=True)
+    for field, cells in ((router, {"cells": torch.arange(8) % 2}), (module, {})):
+        x = torch.tensor(rows, requires_grad=True)
+        y = field(x, **cells)
+        y[y.isfinite()].sum().backward()
+        results.append((y, x.grad))
+    assert router.explain() == "forward: fused"
+    torch.testing.assert_close(*results, rtol=1e-5, atol=1e-6, equal_nan=True)
+
+
 class Parts(nn.Module):
     def __init__(self, forward: Callable[[Any, Tensor], Any]) -> None:
         super().__init__()

@@ -222,6 +222,42 @@ def test_half_precision(generator: torch.Generator, dtype: torch.dtype, make: ty
         torch.testing.assert_close(actual.float(), exact, rtol=0.1, atol=0.05)
 
 
+def test_a_network_in_half_precision_between_floats_is_fused(generator: torch.Generator) -> None:
+    class Between(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 4)).bfloat16()
+
+        def forward(self, x: Tensor) -> Tensor:
+            return self.net(x.bfloat16()).float()
+
+    router = VoronoiRouter(Between(), uniform(generator, 5, 3), coords="first3", fuse=True)
+    x = uniform(generator, 120, 3)
+    actual, (expected, *_) = router(x), masked_loop(router, x)
+    assert actual.dtype == torch.float32 and router.explain().startswith("forward: fused")
+    torch.testing.assert_close(actual, expected, rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("way", ["loop", "grouped"])
+def test_a_module_may_write_into_its_rows(way: str, generator: torch.Generator) -> None:
+    class Writes(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 4)
+
+        def forward(self, x: Tensor) -> Tensor:
+            x[..., 0] *= 2
+            return self.layer(x)
+
+    router = VoronoiRouter(Writes(), uniform(generator, 5, 3), coords="first3", way=way)
+    x = uniform(generator, 120, 3)
+    actual, cells = router(x.clone()), router.diagram.locate(x)
+    actual.sum().backward()
+    written = torch.cat([2 * x[:, :1], x[:, 1:]], 1)
+    for cell, gradient in enumerate(router.module.layer.weight.grad):
+        torch.testing.assert_close(gradient, written[cells == cell].sum(0).expand(4, 3))
+
+
 class Fast(nn.Module):
     """A SIREN network: the factor 30 inside its sines amplifies rounding."""
 

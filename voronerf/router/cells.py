@@ -332,6 +332,7 @@ def _replace_values(parameter: nn.Parameter, values: Tensor) -> None:
         other = torch.float32 if values.dtype == torch.float64 else torch.float64
         parameter.data = values.new_empty(0, dtype=other)
     parameter.data, parameter.grad = values, None
+    torch.autograd.graph.increment_version(parameter)  # backward of an earlier call refuses the new values
 
 
 def draw_parameters(routed: nn.Module, k: int, generator: torch.Generator | None) -> dict[str, Tensor]:

@@ -349,8 +349,8 @@ def recordable(tensor: Tensor) -> Tensor:
 
 
 def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
-    """Splits the rows of all arguments into parts of these sizes."""
-    return [rows] if len(sizes) == 1 else list(zip(*[tensor.split(sizes) for tensor in rows], strict=True))
+    """Splits the rows of all arguments into parts of these sizes. A module may write into its part."""
+    return [rows] if len(sizes) == 1 else list(zip(*[t.unsafe_split_with_sizes(sizes) for t in rows], strict=True))
 
 
 @dataclasses.dataclass

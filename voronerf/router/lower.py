@@ -36,16 +36,22 @@ _MOVERS = frozenset(
     unsafe_split unsafe_split_with_sizes unsafe_chunk
     """.split()  # noqa: SIM905
 )
+_GREATEST = torch.finfo(torch.float32).max
+_FINITE = ("clamp", -_GREATEST, _GREATEST)  # before a difference, which is NaN for equal infinities
+
+
+def _finite(c: float) -> float:
+    return min(max(c, -_GREATEST), _GREATEST)
+
+
 _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     **{
         name: lambda *_, name=name, **__: [(name, 0, 0)]
-        for name in ("relu", "sigmoid", "tanh", "silu", "exp", "log", "abs", "floor", "erf", "atan")
+        for name in "relu sigmoid tanh silu exp expm1 log log1p abs floor erf atan".split()  # noqa: SIM905
     },
     "sin": lambda: [("sine", 1, 0)],
     "cos": lambda: [("sine", 1, math.pi / 2)],
     "neg": lambda: [("affine", -1, 0)],
-    "expm1": lambda: [("exp", 0, 0), ("affine", 1, -1)],
-    "log1p": lambda: [("affine", 1, 1), ("log", 0, 0)],
     "exp2": lambda: [("affine", math.log(2), 0), ("exp", 0, 0)],
     "square": lambda: [("power", 2, 0)],
     "sqrt": lambda: [("power", 0.5, 0)],
@@ -61,11 +67,11 @@ _FUNCTIONS: dict[str, Callable[..., list[tuple[str, float, float]]]] = {
     ],
     "clamp_min": lambda low: [("clamp", low, math.inf)],
     "clamp_max": lambda high: [("clamp", -math.inf, high)],
-    "hardtanh": lambda low=-1, high=1: [("clamp", low, high)],
+    "hardtanh": lambda low=-1, high=1: [("hardtanh", low, high)],
     "gt": lambda c: [("affine", 1, -c), ("step", 0, 0)],
-    "ge": lambda c: [("affine", 1, -c), ("at_least", 0, 0)],
+    "ge": lambda c: [_FINITE, ("affine", 1, -_finite(c)), ("at_least", 0, 0)],
     "lt": lambda c: [("affine", -1, c), ("step", 0, 0)],
-    "le": lambda c: [("affine", -1, c), ("at_least", 0, 0)],
+    "le": lambda c: [_FINITE, ("affine", -1, _finite(c)), ("at_least", 0, 0)],
     "logical_not": lambda: [("affine", -1, 1)],
     "bitwise_not": lambda: [("affine", -1, 1)],
 }
@@ -101,6 +107,12 @@ def _reduced(combine: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any =
 def _maximum(x: Tensor, y: Tensor) -> Tensor:
     # Equal operands get half of the gradient each.
     return torch.where(x > y, x, torch.where(x < y, y, (x + y) / 2))
+
+
+def _largest(x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+    """Returns the largest entries; equal ones share the gradient evenly."""
+    is_largest = x >= _reduced(_maximum, x.detach(), dim, True)
+    return torch.where(is_largest, x, 0.0).sum(dim, keepdim) / is_largest.to(x.dtype).sum(dim, keepdim)
 
 
 def _below_largest(x: Tensor, dim: int) -> Tensor:
@@ -236,8 +248,8 @@ def _sign(x: Tensor) -> Tensor:
 _DECOMPOSED: dict[str, Callable[..., Any]] = {
     "maximum": _maximum,
     "minimum": lambda x, y: -_maximum(-x, -y),
-    "amax": lambda x, dim=None, keepdim=False: _reduced(_maximum, x, dim, keepdim),
-    "amin": lambda x, dim=None, keepdim=False: -_reduced(_maximum, -x, dim, keepdim),
+    "amax": _largest,
+    "amin": lambda x, *args, **kwargs: -_largest(-x, *args, **kwargs),
     "all": lambda x, dim=None, keepdim=False: _reduced(torch.bitwise_and, x, dim, keepdim),
     "any": lambda x, dim=None, keepdim=False: ~_reduced(torch.bitwise_and, ~x, dim, keepdim),
     "mean": _mean,
@@ -607,7 +619,7 @@ class _EntryMode(TorchDispatchMode):
                 raise NotAStep("a function with arguments that are not numbers")
             if name == "affine" and (a, b) == (1, 0):
                 continue
-            x = self.b.apply(name, x, min(max(a, -3e38), 3e38), min(max(b, -3e38), 3e38))
+            x = self.b.apply(name, x, a, b)
         return self._placed(x, places, result.shape)
 
     def _operands(self, tensors: Sequence[Any], shape: Sequence[int]) -> tuple[list[Columns], Tensor]:
@@ -661,6 +673,8 @@ class _EntryMode(TorchDispatchMode):
             b = self.b.apply("affine", b, alpha)
         if kind in ("gt", "ge", "lt", "le"):
             a, b = (a, b) if kind[0] == "g" else (b, a)
+            if kind[1] == "e":
+                a, b = (self.b.apply(*_FINITE[:1], v, *_FINITE[1:]) for v in (a, b))
             column = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
         else:
             column = self.b.binary(kind, a, b)

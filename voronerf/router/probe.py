@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from voronerf.ops._core.backends import BackendUnavailable
-from voronerf.ops._core.tolerances import agree, agree_gradients
+from voronerf.ops._core.tolerances import AGREE, agree, agree_gradients
 from voronerf.router.axes import multiple
 from voronerf.router.cells import clone_module
 from voronerf.router.double import Double, Forbidden, items_of, restore_items
@@ -306,7 +306,7 @@ class Probe:
         results.
         """
         outcome, device = self._outcome(way), self._entries.device.type
-        if _same(outcome, expected):
+        if self._same(outcome, expected):
             return True
         if _kinds(outcome) != _kinds(expected):
             return False
@@ -315,9 +315,24 @@ class Probe:
             for dtype in dtypes:
                 with contextlib.suppress(Exception):
                     exact = Probe(*self._source, dtype, self._others)
-                    if _same(exact._outcome(way), exact._outcome(loop)):
+                    if exact._same(exact._outcome(way), exact._outcome(loop)):
                         return True
         return False
+
+    def _same(self, outcome: Outcome, expected: Outcome) -> bool:
+        """Returns whether results and gradients agree within the rounding of the lowest precision among them."""
+        (a, our_gradients), (b, their_gradients) = outcome, expected
+        if len(a.tensors) != len(b.tensors) or len(our_gradients) != len(their_gradients):
+            return False
+        dtypes = [t.dtype for t in (*b.tensors, *self._call.module.parameters()) if t.dtype in AGREE]
+        lowest = max(dtypes, key=AGREE.__getitem__, default=torch.float32)
+
+        def rounded(tensor: Tensor) -> Tensor:
+            return tensor.to(lowest) if tensor.is_floating_point() else tensor
+
+        pairs = zip(a.tensors, b.tensors)
+        same_results = all(x.dtype == y.dtype and agree(rounded(x), rounded(y)) for x, y in pairs)
+        return same_results and agree_gradients(our_gradients, their_gradients)
 
     def _fused(self, loop: Way, expected: Outcome, inputs: Sequence[Inputs]) -> Way:
         """Returns the fused evaluation; raises an exception if the network cannot be fused."""
@@ -374,12 +389,6 @@ def _same_items(container: Any, items: Any) -> bool:
         else zip(container, items)
     )
     return all(x is y for x, y in pairs)
-
-
-def _same(outcome: Outcome, expected: Outcome) -> bool:
-    (a, our_gradients), (b, their_gradients) = outcome, expected
-    same_counts = len(a.tensors) == len(b.tensors) and len(our_gradients) == len(their_gradients)
-    return same_counts and all(map(agree, a.tensors, b.tensors)) and agree_gradients(our_gradients, their_gradients)
 
 
 def _kinds(outcome: Outcome) -> list[tuple[torch.Size, torch.dtype]]:

@@ -28,7 +28,7 @@ FUNCTIONS = {
     "relu": "max(x, vec4f())",
     "leaky_relu": "select({a} * x, x, x > vec4f())",
     "abs": "abs(x)",
-    "clamp": "clamp(x, vec4f({a}), vec4f({b}))",
+    **dict.fromkeys(("clamp", "hardtanh"), "clamp(x, vec4f({a}), vec4f({b}))"),
     "softplus": "softplus({a} * x) / {a}",
     "sigmoid": "sigmoid(x)",
     "tanh": "tanh(clamp(x, vec4f(-15), vec4f(15)))",
