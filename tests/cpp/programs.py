@@ -110,8 +110,8 @@ def any_steps(draw: random.Random) -> Program:
             x = b.apply("tanh", some(width))
             if name in POSITIVE:
                 x = b.apply("affine", x, 0.5, 1.0)
-            numbers = (-0.5, 0.5) if name in ("clamp", "hardtanh") else (draw.choice((0.5, 2.0)), draw.choice((0.0, 1.0)))
-            return b.apply(name, x, *numbers)
+            scale, shift = draw.choice((0.5, 2.0)), draw.choice((0.0, 1.0))
+            return b.apply(name, x, *((-0.5, 0.5) if name in ("clamp", "hardtanh") else (scale, shift)))
         if kind == "jump":
             x = draw.choice(inputs)
             return b.apply(draw.choice(JUMPS), x)

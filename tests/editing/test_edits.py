@@ -279,13 +279,25 @@ def test_what_cannot_be_joined(runs, tmp_path) -> None:
 def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_path) -> None:
     frames = [Similarity.of((3, 0, 0), (0, 0, 90), 0.5), Similarity.of((0, 0, 1), (40, 0, 0))]
     joined = joined_run(opened, tmp_path / "joined", frames=frames)
-    moved = edits.moved_cameras(scene.test.cameras, frames[0]).poses
+    moved = scene.test.cameras.moved(frames[0].matrix).poses
     assert torch.allclose(joined.scene.test.cameras.poses, moved, atol=1e-5)
     assert torch.equal(joined.scene.test.images, scene.test.images)
     record = read_scene(tmp_path / "joined" / "scene.json")
     assert record.test.names == tuple(f"{i}-{name}" for i in (0, 1) for name in scene.test.names)
     other = replace(scene, test=replace(scene.test, names=("a", "b")))
     assert torch.equal(editing.open_run(joined.path, scene=other).scene.test.cameras.poses, scene.test.cameras.poses)
+
+
+@pytest.mark.slow
+def test_a_join_of_joins_keeps_every_pose(opened, scene, tmp_path) -> None:
+    places = [[Similarity.of((0, 0, 1)), Similarity.of((x, 0, 0))] for x in (2, 3)]
+    pairs = [joined_run(opened, tmp_path / f"pair-{i}", frames=frames) for i, frames in enumerate(places)]
+    both = joined_run(pairs, tmp_path / "both")
+    poses = [read_scene(run.path / "scene.json").test.cameras.poses for run in (*pairs, both)]
+    assert torch.equal(poses[2].flatten(1).unique(dim=0), torch.cat(poses[:2]).flatten(1).unique(dim=0))
+    names = read_scene(both.path / "scene.json").test.names
+    shown, first = (run.scene.test.cameras.poses for run in (both, pairs[0]))
+    assert len(set(names)) == len(names) and torch.equal(shown, first)
 
 
 def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opened, tmp_path, scene) -> None:
@@ -297,7 +309,7 @@ def test_a_run_of_parts_is_neither_opened_nor_trained_as_one_of_a_training(opene
 
 def test_runs_are_aligned_by_shared_images(scene) -> None:
     frame = Similarity.of((1, 2, 3), (10, 20, 30), 1.7)
-    moved = with_cameras(scene, lambda cameras: edits.moved_cameras(cameras, frame.inverse))
+    moved = with_cameras(scene, lambda cameras: cameras.moved(frame.inverse.matrix))
     fitted, error, count = edits.align(scene, moved, "run")
     assert count == 8 and error < 1e-5
     assert abs(fitted.scale - 1.7) < 1e-5 and torch.allclose(fitted.translation, frame.translation, atol=1e-4)

@@ -285,31 +285,27 @@ def _corners(box: Tensor | None) -> Tensor:
 def _join_views(views: Sequence[tuple[tuple[str, str], Split, Similarity]]) -> Split:
     """Joins the cameras of several splits, without images; ``views`` has each split with its scene and its place.
 
-    Of views with the same name, scene and place, only the first is kept. If names still repeat, all names get the
-    number of their scene as a prefix.
+    A view that has the name, scene, place and pose of an earlier one is left out. If names still repeat, all names get
+    the number of their scene as a prefix; views of one name and several poses count as several scenes.
     """
-    cameras, names = list[Cameras](), dict[tuple[str, str], dict[str, None]]()
+    cameras, scenes = list[Cameras](), list[tuple[tuple[str, str], dict[str, Tensor]]]()
     for place, split, frame in views:
-        known = names.setdefault(place, {})
+        moved = split.cameras if frame.is_identity else split.cameras.moved(frame.matrix)
+        poses = dict(zip(split.names, moved.poses, strict=True))
+        for other, known in scenes:
+            if other == place and all(torch.equal(known[name], poses[name]) for name in known.keys() & poses.keys()):
+                break
+        else:
+            scenes.append((place, known := {}))
         new = [number for number, name in enumerate(split.names) if name not in known]
-        known |= dict.fromkeys(split.names)
+        known |= poses
         if new:
-            cameras.append(moved_cameras(split.cameras[new], frame))
-    every = [name for known in names.values() for name in known]
+            cameras.append(moved[new])
+    every = [name for _, known in scenes for name in known]
     if len(set(every)) < len(every):
-        every = [f"{i}-{name}" for i, known in enumerate(names.values()) for name in known]
+        every = [f"{i}-{name}" for i, (_, known) in enumerate(scenes) for name in known]
     none = torch.empty(0, 1, 1, 3, dtype=torch.uint8, device="cpu")
     return Split(cameras[0] if len(cameras) == 1 else Cameras.joined(cameras), none, tuple(every))
-
-
-def moved_cameras(cameras: Cameras, frame: Similarity) -> Cameras:
-    """Moves cameras by a similarity."""
-    if frame.is_identity:
-        return cameras
-    poses = cameras.poses.clone()
-    poses[:, :3, :3] = frame.rotation.to(poses) @ poses[:, :3, :3]
-    poses[:, :3, 3] = frame.points(cameras.origins)
-    return replace(cameras, poses=poses)
 
 
 def _join_grids(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> OccupancyGrid | None:

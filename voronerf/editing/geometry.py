@@ -90,6 +90,12 @@ class Similarity:
         """The inverse similarity, from the scene to the part."""
         return Similarity(1 / self.scale, self.rotation.T, -(self.translation @ self.rotation) / self.scale)
 
+    @functools.cached_property
+    def matrix(self) -> Tensor:
+        """The similarity as a matrix, [4, 4]."""
+        top = torch.cat((self.scale * self.rotation, self.translation[:, None]), 1)
+        return torch.cat((top, torch.tensor([[0.0, 0, 0, 1]], dtype=torch.float64, device="cpu")))
+
     def __matmul__(self, first: Similarity) -> Similarity:
         """Composes two similarities: applies ``first``, then this one."""
         return Similarity(self.scale * first.scale, self.rotation @ first.rotation, self.points(first.translation))

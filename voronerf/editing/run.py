@@ -179,7 +179,8 @@ def _in_place(read: Scene, record: Scene) -> Scene:
     for name in ("train", "test"):
         views, recorded = getattr(read, name), getattr(record, name)
         names = recorded.names[: len(views)]
-        if names not in (views.names, tuple(f"0-{view}" for view in views.names)):
+        prefix = "".join(names[:1]).removesuffix("".join(views.names[:1]))  # of the first scene of each join
+        if prefix.replace("0-", "") or names != tuple(prefix + view for view in views.names):
             return placed(read, record)
         cameras = replace(views.cameras, poses=recorded.cameras.poses[: len(views)].to(views.cameras.poses))
         splits[name] = replace(views, cameras=cameras, names=names, sparse_depth=None)
