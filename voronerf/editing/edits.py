@@ -5,9 +5,11 @@ Positions are in units of the new scene. The source runs are never changed.
 
 from __future__ import annotations
 
+import glob
 import itertools
 import math
 import os
+import platform
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -226,7 +228,7 @@ def join_sources(sources: Sequence[RunContents], frames: Sequence[Similarity], *
         above = max((part.layer for part in parts), default=-1) + 1 if on_top and index else 0
         parts += [part.changed(frame=frame @ part.frame, layer=part.layer + above) for part in source.parts]
     joined = Parts(parts, backend=first.parts.backend)
-    scene = _join_scenes(sources, frames)
+    scene = _join_scenes(sources, frames, on_top)
     settings, grid = _settings(sources, frames, scene), _join_grids(sources, frames)
     is_incomplete = any(source.cut for source in (sources[:1] if on_top else sources))  # an object is cut out anyway
     return RunContents(first.name, settings, scene, joined, grid, is_incomplete)
@@ -254,8 +256,8 @@ def _settings(sources: Sequence[RunContents], frames: Sequence[Similarity], scen
     return replace(first, sampling="stratified", samples=(min(samples, 32_000),), out=None)
 
 
-def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> Scene:
-    """Joins the views and the boxes of all sources; a view that occurs twice in the same place counts once."""
+def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity], on_top: bool) -> Scene:
+    """Joins the boxes and, unless ``on_top``, the views of all sources; the coordinates of files are the first's."""
     first, box = sources[0].scene, sources[0].scene.box
     if box is not None:
         corners = torch.cat([frame.points(_corners(s.scene.box)) for s, frame in zip(sources, frames, strict=True)])
@@ -265,16 +267,15 @@ def _join_scenes(sources: Sequence[RunContents], frames: Sequence[Similarity]) -
     pairs = [*zip(sources, frames, strict=True)]
     near = min(source.scene.near * frame.scale for source, frame in pairs)
     far = max(source.scene.far * frame.scale for source, frame in pairs)
-    places = [(source.config.data, str(frame.to_values())) for source, frame in pairs]
     train, test = (
-        _join_views([(place, getattr(source.scene, part), frame) for place, (source, frame) in zip(places, pairs)])
+        _join_views([(getattr(source.scene, part), frame) for source, frame in (pairs[:1] if on_top else pairs)])
         for part in ("train", "test")
     )
     if box is not None:
         distances = (torch.cat((train.cameras.origins, test.cameras.origins))[:, None] - _corners(box)).norm(dim=-1)
         far = max(far, 1.01 * float(distances.max()))
-    moved = None if len({*places}) > 1 or not frames[0].is_identity else first.transform
-    return replace(first, train=train, test=test, near=near, far=far, box=box, transform=moved)
+    transform = frames[0].matrix @ first.transform
+    return replace(first, train=train, test=test, near=near, far=far, box=box, transform=transform)
 
 
 def _corners(box: Tensor | None) -> Tensor:
@@ -282,30 +283,28 @@ def _corners(box: Tensor | None) -> Tensor:
     return torch.cartesian_prod(*box.float().T)
 
 
-def _join_views(views: Sequence[tuple[tuple[str, str], Split, Similarity]]) -> Split:
-    """Joins the cameras of several splits, without images; ``views`` has each split with its scene and its place.
+def _join_views(views: Sequence[tuple[Split, Similarity]]) -> Split:
+    """Joins the cameras of several splits, without images; ``views`` has each split with its place.
 
-    A view that has the name, scene, place and pose of an earlier one is left out. If names still repeat, all names get
-    the number of their scene as a prefix; views of one name and several poses count as several scenes.
+    A view with the name and the pose of an earlier one is left out. A split that has other poses under the names of
+    earlier splits is another scene; with several scenes, all names get the number of their scene as a prefix.
     """
-    cameras, scenes = list[Cameras](), list[tuple[tuple[str, str], dict[str, Tensor]]]()
-    for place, split, frame in views:
+    cameras, names, scenes = list[Cameras](), list[tuple[int, str]](), list[dict[str, Tensor]]()
+    for split, frame in views:
         moved = split.cameras if frame.is_identity else split.cameras.moved(frame.matrix)
         poses = dict(zip(split.names, moved.poses, strict=True))
-        for other, known in scenes:
-            if other == place and all(torch.equal(known[name], poses[name]) for name in known.keys() & poses.keys()):
-                break
-        else:
-            scenes.append((place, known := {}))
-        new = [number for number, name in enumerate(split.names) if name not in known]
+        same = [all(torch.equal(seen[name], poses[name]) for name in seen.keys() & poses.keys()) for seen in scenes]
+        number = (*same, True).index(True)
+        scenes += [{}] * (number == len(scenes))
+        known = scenes[number]
+        new = [index for index, name in enumerate(split.names) if name not in known]
         known |= poses
         if new:
             cameras.append(moved[new])
-    every = [name for _, known in scenes for name in known]
-    if len(set(every)) < len(every):
-        every = [f"{i}-{name}" for i, (_, known) in enumerate(scenes) for name in known]
+            names += [(number, split.names[index]) for index in new]
     none = torch.empty(0, 1, 1, 3, dtype=torch.uint8, device="cpu")
-    return Split(cameras[0] if len(cameras) == 1 else Cameras.joined(cameras), none, tuple(every))
+    every = tuple(f"{number}-{name}" if len(scenes) > 1 else name for number, name in names)
+    return Split(cameras[0] if len(cameras) == 1 else Cameras.joined(cameras), none, every)
 
 
 def _join_grids(sources: Sequence[RunContents], frames: Sequence[Similarity]) -> OccupancyGrid | None:
@@ -558,11 +557,12 @@ def _write(source: RunContents, out: Path) -> RunContents:
     """Writes a run of parts into a new folder, atomically."""
     check_out(out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    for leftover in out.parent.glob(".*.[0-9]*.partial"):
+    host = glob.escape(platform.node())  # other machines may write into a shared folder
+    for leftover in out.parent.glob(f".*.{host}.[0-9]*.partial"):
         number = leftover.suffixes[-2][1:]
         if number.isdecimal() and not _process_exists(int(number)):  # the process that wrote it was killed
             shutil.rmtree(leftover, ignore_errors=True)
-    partial = out.parent / f".{out.name[:100]}.{os.getpid()}.partial"
+    partial = out.parent / f".{out.name[:100]}.{platform.node()}.{os.getpid()}.partial"
     try:
         partial.mkdir()
         config = replace(source.config, out=out)

@@ -155,7 +155,7 @@ def open_run(
     config = config_of(checkpoint)
     check_samples(replace(config, samples=samples))
     config, scene = shown_scene(path, config, scene, data, downscale, allow_outside)
-    scene = _in_place(scene, read_scene(path / "scene.json"))
+    scene = placed(scene, read_scene(path / "scene.json"))
     parts = open_parts(path, checkpoint, device, backend)
     for part in parts:
         part.open()
@@ -167,21 +167,3 @@ def open_run(
         grid = OccupancyGrid.from_state(state, device=device)
         sampler = Occupancy(grid, count, picture_samples=picture, space=space, backend=backend)
     return Run(path, config, scene, parts, Renderer({"field": parts}, sampler, backend=backend))
-
-
-def _in_place(read: Scene, record: Scene) -> Scene:
-    """Replaces the poses of a scene's views by the poses of ``record``, the scene that the run has stored.
-
-    If the views have other names than the first views of ``record``, they keep their own poses, moved into the space of
-    ``record``.
-    """
-    splits = {}
-    for name in ("train", "test"):
-        views, recorded = getattr(read, name), getattr(record, name)
-        names = recorded.names[: len(views)]
-        prefix = "".join(names[:1]).removesuffix("".join(views.names[:1]))  # of the first scene of each join
-        if prefix.replace("0-", "") or names != tuple(prefix + view for view in views.names):
-            return placed(read, record)
-        cameras = replace(views.cameras, poses=recorded.cameras.poses[: len(views)].to(views.cameras.poses))
-        splits[name] = replace(views, cameras=cameras, names=names, sparse_depth=None)
-    return replace(record, **splits)

@@ -20,12 +20,13 @@ from voronerf.app.evaluate.panels import palette
 from voronerf.app.evaluate.scores import in_silence
 from voronerf.app.export import cell_meshes, export_cells, export_mesh, export_points
 from voronerf.app.export.mesh import REACH, _fused
-from voronerf.app.export.space import SurfaceView, placed, views_of, write_geometry
+from voronerf.app.export.space import SurfaceView, views_of, write_geometry
 from voronerf.app.run import Run
 from voronerf.app.scenes import builtin_scene
 from voronerf.app.train.config import ConfigError
 from voronerf.nerf import Cameras, Contraction, orbit_cameras
 from voronerf.nerf.cameras import look_at
+from voronerf.nerf.contraction import Perspective
 
 trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
 pytest.importorskip("skimage", reason="scikit-image is not installed")
@@ -313,6 +314,8 @@ def test_cells_are_objects_of_their_own_colour(run, tmp_path, to_files):
 
 def test_what_is_refused(run, tmp_path, monkeypatch):
     path = tmp_path / "mesh.ply"
+    forward = replace(run, renderer=SimpleNamespace(contraction=object.__new__(Perspective)))
+    refuses("--cells needs cells with flat sides", export_cells, forward, tmp_path / "a.glb", error=ConfigError)
     refuses("mesh.stl: the file must end in .ply or .glb or .obj", export_mesh, run, tmp_path / "mesh.stl")
     refuses("cells.ply: the file must end in .glb", export_cells, run, tmp_path / "cells.ply")
     refuses("points.xyz: the file must end in .ply", export_points, run, tmp_path / "points.xyz")
@@ -324,8 +327,6 @@ def test_what_is_refused(run, tmp_path, monkeypatch):
     folder.mkdir()
     refuses("folder.ply: must be a file, got a folder", export_mesh, run, folder)
     folder.rmdir()
-    joined = replace(run, scene=replace(run.scene, kind="unbounded", transform=None))
-    refuses("--coordinates must be scene", placed, joined, None, True, error=ConfigError)
     unbounded = replace(run, scene=replace(run.scene, box=None))
     refuses("--crop must be given", export_points, unbounded, path, error=ConfigError)
     for export in (export_points, export_mesh):

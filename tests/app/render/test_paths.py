@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import all_pairs, read_json, refuses
+from PIL import Image
 
 from voronerf.app.export.video import video_cameras
 from voronerf.app.render.paths import (
@@ -29,7 +30,7 @@ from voronerf.nerf import Cameras, focus_point, orbit_cameras, turntable_cameras
 from voronerf.nerf.cameras import look_at, shared_focus
 
 sys.path.append(str(Path(__file__).parents[1] / "scenes"))
-from scene_files import COUNT, POSES, SIZE, rewrite, write_both, write_capture, write_frames
+from scene_files import COUNT, POSES, SIZE, oriented, rewrite, write_both, write_capture, write_frames
 
 LEVEL = [1, 0, 0, 4, 0, 0, -1, -5, 0, 1, 0, 6, 0, 0, 0, 1]  # at (4, -5, 6), looks along +y, z is up
 
@@ -387,6 +388,15 @@ def test_cameras_of_a_capture_are_in_the_coordinates_of_its_files(tmp_path, lens
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(COUNT, 3, 3), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("tag", [3, 6])
+def test_cameras_of_photographs_that_their_tags_turn(tmp_path, tag):
+    views = Cameras(POSES, torch.tensor([[20.0, 20, 6, 5]]).repeat(COUNT, 1), *SIZE)
+    write_capture(tmp_path, views, **LENSES["distorted"])
+    for path in tmp_path.glob("*.png"):
+        Image.open(path).save(path, exif=oriented(tag))
+    check_same_cameras(tmp_path / "transforms.json", load_scene(tmp_path))
+
+
 @pytest.mark.parametrize("normalise", [True, False])
 def test_cameras_beside_a_colmap_model(tmp_path, normalise):
     write_both(tmp_path)
@@ -433,4 +443,3 @@ def test_cameras_that_cannot_be_read(tmp_path, frames, rule):
     file, scene = tmp_path / "transforms.json", builtin_scene(2, train_views=1, test_views=1)
     file.write_text(json.dumps({"frames": frames}))
     refuses(rule, read_cameras, file, scene)
-    refuses("the coordinates of its files are not known", read_cameras, file, replace(scene, kind="unbounded"))

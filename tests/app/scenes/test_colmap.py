@@ -312,6 +312,12 @@ def test_lists_of_test_images(tmp_path, model, lists, train, test, notes):
     assert said == (len(test) + len(train) < 9 or tuple(test) != (0, 8))
 
 
+def test_lists_and_names_of_windows(tmp_path):
+    write_named(tmp_path, "a\\{:02d}.jpg".format, "a/{:02d}.jpg".format)
+    write_list(tmp_path / "sparse/0/test.txt", "a\\03.jpg")
+    assert load_scene(tmp_path).test.names == ("03",)
+
+
 def test_lists_of_llff_and_lists_that_are_broken(tmp_path):
     write_both(tmp_path)
     write_list(tmp_path / "test_list.txt", "03.jpg")

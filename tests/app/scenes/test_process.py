@@ -566,6 +566,14 @@ def test_the_images_of_a_folder_are_taken_once_and_what_is_left_out_is_said(tmp_
     assert len(said) == len(lines) and all(part in line for part, line in zip(lines, said)), said
 
 
+def test_a_folder_under_another_path_is_the_same(tmp_path, monkeypatch):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.png").write_bytes(b"1")
+    monkeypatch.chdir(tmp_path)
+    names = dict.fromkeys(("frames", "matching", "camera_model", "max_features", "size"), 1)
+    assert process.Settings.of([type(tmp_path)("photos")], **names) == process.Settings.of([tmp_path / "photos"], **names)
+
+
 def test_images_of_two_folders_must_not_get_one_name(tmp_path):
     for name in ("a/b_0.jpg", "a_b/0.jpg"):
         (tmp_path / "in" / name).parent.mkdir(parents=True)

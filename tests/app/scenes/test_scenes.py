@@ -5,6 +5,7 @@ import json
 import logging
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -167,6 +168,19 @@ def test_a_picture_of_blender_that_is_listed_twice_is_not_also_held_out(tmp_path
     scene = load_scene(tmp_path)
     assert sorted(scene.train.names + scene.test.names) == [f"r_{index}" for index in range(9)]
     assert scene.test.names == ("r_0", "r_8")
+
+
+@pytest.mark.parametrize("scale", [0.25, 3.0])
+def test_blender_cameras_at_other_distances(tmp_path, scale):
+    original = builtin_scene(12, train_views=5, test_views=1)
+    cameras = original.train.cameras
+    poses = torch.cat((cameras.poses[:, :3, :3], scale * cameras.poses[:, :3, 3:]), 2)
+    train = replace(original.train, cameras=replace(cameras, poses=torch.cat((poses, cameras.poses[:, 3:]), 1)))
+    write_blender(tmp_path, replace(original, train=train), 0.69)
+    scene, distance = load_scene(tmp_path), scale * float(cameras.origins.norm(dim=-1).median())
+    assert (scene.near, scene.far) == pytest.approx((distance / 2, 1.5 * distance), rel=0.01)
+    write_blender(tmp_path / "usual", original, 0.69)
+    torch.testing.assert_close(scene.box, scale * load_scene(tmp_path / "usual").box, rtol=0.1, atol=0.1 * scale)
 
 
 def test_a_single_picture_of_blender_is_too_few(tmp_path):

@@ -47,7 +47,7 @@ def export(
             the scene's box. For a scene without a box, the mesh covers the region that the cameras look at; points and
             cells cover the box around the sphere of the contraction.
         coordinates: Coordinates of points, meshes and cells: of the rendered scene, or of the scene's files (in metres
-            if the capture is).
+            if the capture is; for a transforms.json, before its applied_transform).
         opening: The settings with which the run is opened.
     """
     check_counts(count=count)
@@ -56,8 +56,11 @@ def export(
         mesh: mesh_files.SUFFIXES,
         cells: cell_files.SUFFIXES,
     }
-    if not any((points, mesh, cells, web)):
+    files = [file.resolve() for file in (points, mesh, cells, web) if file is not None]
+    if not files:
         raise ConfigError("export needs a file: --points, --mesh, --cells or --web")
+    if len(set(files)) < len(files):
+        raise ConfigError(f"--points, --mesh, --cells and --web must name different files, got {files[0]} twice")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)

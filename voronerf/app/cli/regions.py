@@ -29,5 +29,6 @@ def regions(data: str, /, count: int, out: Path = Path("runs")) -> int:
     for run, box in zip(runs, boxes, strict=True):
         corners = [f"{value:.6g}" for value in box.flatten().tolist()]
         say(shlex.join(["voronerf", "train", "--data", data, "--region", *corners, "--out", run]))
-    say(shlex.join(["voronerf", "join", *runs, "--out", str(out / "joined")]))
+    if count > 1:
+        say(shlex.join(["voronerf", "join", *runs, "--out", str(out / "joined")]))
     return 0

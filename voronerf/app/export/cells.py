@@ -17,7 +17,9 @@ from torch import Tensor
 from voronerf.app.evaluate.panels import palette
 from voronerf.app.export.space import box_of, check_export, placed, write_geometry
 from voronerf.app.run import Run
+from voronerf.app.train.config import ConfigError
 from voronerf.diagram import VoronoiDiagram
+from voronerf.nerf.contraction import Perspective
 
 SUFFIXES = (".glb",)
 #: The minimum inscribed radius of an exported cell, as a fraction of the box's longest side.
@@ -37,7 +39,7 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
         to_files: Write coordinates of the scene's files instead of scene coordinates.
 
     Raises:
-        ConfigError: The scene has no box, and none is given.
+        ConfigError: The scene has no box, and none is given; or its cells are in normalised device coordinates.
         ImportError: trimesh or scipy is missing.
         ValueError: The suffix is not .glb.
         OSError: The file cannot be written.
@@ -50,6 +52,10 @@ def export_cells(run: Run, path: Path | str, *, box: Tensor | None = None, to_fi
     """
     path = Path(path)
     check_export(path, SUFFIXES)
+    if isinstance(run.renderer.contraction, Perspective):
+        raise ConfigError(
+            "--cells needs cells with flat sides, got cells of a forward-facing scene (--contraction ndc)"
+        )
     import trimesh
 
     scene = trimesh.Scene()

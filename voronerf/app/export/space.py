@@ -66,9 +66,7 @@ def write_geometry(path: Path, geometry: Any, **options: Any) -> None:
 
 def placed(run: Run, geometry: Any, to_files: bool) -> Any:
     """Returns a mesh or points of trimesh, moved into the coordinates of the scene's files if ``to_files``."""
-    if to_files and run.scene.transform is None and run.scene.kind != "object":
-        raise ConfigError("--coordinates must be scene: the run is joined from several, got files")
-    if to_files and run.scene.transform is not None:
+    if to_files:
         geometry.apply_transform(torch.linalg.inv(run.scene.transform).numpy())
     return geometry
 

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, read_json, write_text
+from voronerf.app.scenes.photographs import turned_cameras
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import views_without_images
 from voronerf.nerf.cameras import Cameras, focus_point, look_at, shared_focus
@@ -146,7 +147,7 @@ def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
         downscale: the factor by which stated sizes are reduced.
 
     Raises:
-        ValueError: the file is invalid, or the coordinates of the scene's files are unknown.
+        ValueError: the file is invalid.
         OSError: the file cannot be read.
 
     Examples:
@@ -163,13 +164,11 @@ def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
         (1, 5)
     """
     file = Path(file)
-    if scene.transform is None and scene.kind != "object":
-        raise ValueError(f"{file}: the scene is joined from several, and the coordinates of its files are not known")
     if not 1 <= (count := len(read_json(file, dict)["frames"])) <= MOST_FRAMES:
         raise ValueError(f"{file}: frames must be a list of 1 to {MOST_FRAMES} frames, got {count} of them")
     default = like_most(scene.train.cameras)
     views, applied = views_without_images(file, (default.width * downscale, default.height * downscale))
-    matrix = torch.linalg.inv(applied) if scene.transform is None else scene.transform @ torch.linalg.inv(applied)
+    matrix = scene.transform @ torch.linalg.inv(applied)
     poses = matrix @ torch.stack([view.pose for view in views])
     poses[:, :3, :3] /= torch.linalg.det(matrix[:3, :3]) ** (1 / 3)
     sizes = torch.tensor([view.size for view in views], device="cpu").long()
@@ -181,7 +180,8 @@ def read_cameras(file: Path | str, scene: Scene, downscale: int = 1) -> Cameras:
         poses.float(), coefficients.new_tensor([view.lens.intrinsics for view in views]), sizes, *lenses
     )
     try:
-        cameras = _of_one_size(cameras.downscaled(downscale))
+        turns = [view.header.turns if view.header else 0 for view in views]
+        cameras = _of_one_size(turned_cameras(cameras.downscaled(downscale), turns))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
     if max(cameras.width, cameras.height) > LONGEST_SIDE:
@@ -210,10 +210,13 @@ def write_camera_path(file: Path | str, path: CameraPath) -> None:
     becomes the centre of the frame.
     """
     model = PERSPECTIVE if path.frames.models is None else int(path.frames.models[0])
+    name = next((name for name, number in MODELS.items() if number == model), None)
+    if name is None:
+        raise ValueError(f"{file}: cameras of a path must be {', '.join(MODELS)}, got another lens")
     size = {"render_height": path.frames.height, "render_width": path.frames.width}
     keyframes = [] if path.keyframes is None else _entries(path.keyframes, "matrix")
     entries = {
-        "camera_type": next(name for name, number in MODELS.items() if number == model),
+        "camera_type": name,
         **size,
         "fps": path.fps,
         "seconds": len(path.frames) / path.fps,

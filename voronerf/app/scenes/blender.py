@@ -1,6 +1,6 @@
 """Blender synthetic scenes (Mildenhall et al. 2020): `transforms_train.json`, `transforms_test.json`, RGBA images.
 
-The object sits at the origin, cameras look at it from about 4 units away, and the background is white.
+Cameras look at the object, in the usual files from about 4 units away, and the background is white.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ from voronerf.app.scenes.transforms import (
     read_transforms,
     time_notes,
 )
-from voronerf.nerf.cameras import Cameras
+from voronerf.nerf.cameras import Cameras, focus_point
 
 log = logging.getLogger(__name__)
 
-NEAR, FAR = 2.0, 6.0
+#: The usual distances of cameras from the object.
+USUAL = (3.0, 5.0)
 
 
 def load_blender(folder: Path, reading: Reading) -> Scene:
@@ -41,8 +42,9 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
     as in `load_transforms`, with this split.
 
     Returns:
-        The scene, with near 2 and far 6 or the file's `near` and `far`, and a box carved from the alpha masks of the
-        training views; without alpha the box is None. For a capture see `load_transforms`.
+        The scene, with the file's `near` and `far`, or 2 and 6, or half and 1.5 times the distance of the cameras from
+        the point they look at, if it is not 3 to 5; and a box carved from the alpha masks of the training views;
+        without alpha the box is None. For a capture see `load_transforms`.
     """
     train_file = folder / "transforms_train.json"
     entries, train_frames, notes = read_transforms(train_file, reading.allow_outside)
@@ -66,17 +68,19 @@ def load_blender(folder: Path, reading: Reading) -> Scene:
 
     if reading.kind not in ("auto", "object"):
         raise SceneError(f"{train_file}: --kind must be auto or object for a Blender scene, got {reading.kind}")
-    near = number(entries, "near", train_file, positive=True) or NEAR
-    far = number(entries, "far", train_file, positive=True) or FAR
-    if near >= far:
-        raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
-
     downscale = reading.downscale or 1
     paths = [frame.path for frame in (*train_frames, *test_frames)]
     images, sizes, on_disk, _ = read_images(paths, downscale, keep=reading.images, name=folder.resolve().name)
     count = len(train_frames)
     train = _split(train_frames, images[:count], sizes[:count], downscale, on_disk)
     test = _split(test_frames, images[count:], sizes[count:], downscale, on_disk)
+    focus = focus_point(train.cameras)
+    distance = 4.0 if focus is None else float((train.cameras.origins - focus).norm(dim=-1).median())
+    distance = 4.0 if USUAL[0] <= distance <= USUAL[1] else distance
+    near = number(entries, "near", train_file, positive=True) or 0.5 * distance
+    far = number(entries, "far", train_file, positive=True) or 1.5 * distance
+    if near >= far:
+        raise SceneError(f"{train_file}: near must be below far, got {near} and {far}")
     box = carve_box(train.cameras, train.images[..., 3], near, far) if images.shape[-1] == 4 else None
     frames = [*train_frames, *test_frames]
     masks = ("its masks are not used, only the alpha channel",) * any(frame.mask for frame in frames)

@@ -35,7 +35,7 @@ from voronerf.app.scenes.folders import (
 )
 from voronerf.app.scenes.images import read_header
 from voronerf.app.scenes.lenses import EQUIRECTANGULAR, MODELS, OTHER_MODELS, Lens, colmap_lens
-from voronerf.app.scenes.names import stay_inside
+from voronerf.app.scenes.names import plain, stay_inside
 from voronerf.app.scenes.photographs import Reading, View, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.transforms import LARGEST, LONGEST
@@ -396,7 +396,7 @@ def load_colmap(folder: Path, reading: Reading) -> Scene:
         size = (float(image.camera.width), float(image.camera.height))
         points = points_seen(image, model)
         pose, bounds, seen = torch.from_numpy(image.pose), depth_bounds(image, points), torch.from_numpy(points)
-        views.append(View(file, pose, image.camera.lens, size, mask, bounds, seen, header, name=image.name))
+        views.append(View(file, pose, image.camera.lens, size, mask, bounds, seen, header, name=plain(image.name)))
     kinds = sorted({image.camera.model for image in model.images})
     about = [f"COLMAP model {place.relative_to(folder)} of {len(views)} images, {' and '.join(kinds)}"]
     if counts:

@@ -183,12 +183,12 @@ def photograph_scene(
     poses = torch.stack([view.pose for view in views])
     pictures, masks, kind, masked = _read_pictures(views, poses, factor, reading, source, name)
     bounds = torch.tensor([view.bounds for view in views if view.bounds is not None], dtype=torch.float64, device="cpu")
-    upright = _turned(_of_poses(poses), pictures.turns).poses
+    upright = turned_cameras(_of_poses(poses), pictures.turns).poses
     frame = find_frame(upright, kind, bounds if len(bounds) else None, normalise=reading.normalise)
     cameras = _cameras(frame.poses(poses), views, pictures.sizes, source)
     contraction = _contraction(kind, frame, cameras)
     # Cameras are turned after they are downscaled, since downscaling drops rows and columns of the stored images.
-    cameras = _turned(cameras.downscaled(factor), pictures.turns)
+    cameras = turned_cameras(cameras.downscaled(factor), pictures.turns)
     try:
         _ = cameras.lenses
     except ValueError as error:
@@ -292,7 +292,7 @@ def _as_stored(view: View) -> View:
     intrinsics, coefficients = (poses.new_tensor([row]) for row in (view.lens.intrinsics, view.lens.coefficients))
     sizes = torch.tensor([view.size], dtype=torch.float32, device="cpu")
     cameras = Cameras.of_images(poses, intrinsics, sizes, coefficients, model)
-    stored = _turned(cameras, [4 - turns])
+    stored = turned_cameras(cameras, [4 - turns])
     assert stored.distortion is not None
     lens = Lens(tuple(stored.intrinsics[0].tolist()), tuple(stored.distortion[0].tolist()), view.lens.model)
     return view._replace(pose=stored.poses[0], lens=lens, size=view.size[::-1] if turns % 2 else view.size)
@@ -305,7 +305,8 @@ def _training_first(views: Sequence[View], held_out: Tensor | None, source: Path
     order = held_out.int().argsort(stable=True).tolist()
     count = int((~held_out).sum())
     if not 0 < count < len(views):
-        raise SceneError(f"{source}: needs at least two images, since one is held out for testing")
+        rule = "needs at least one image for training and one that is held out for testing"
+        raise SceneError(f"{source}: {rule}, got {count} and {len(views) - count}")
     return [views[index] for index in order], count
 
 
@@ -563,7 +564,7 @@ def _cameras(poses: Tensor, views: Sequence[View], sizes: Tensor, source: Path) 
     return Cameras.of_images(poses.float(), coefficients.new_tensor(intrinsics), sizes, distortion, others)
 
 
-def _turned(cameras: Cameras, turns: Sequence[int]) -> Cameras:
+def turned_cameras(cameras: Cameras, turns: Sequence[int]) -> Cameras:
     """Returns cameras of images turned anticlockwise by ``turns`` quarters; the turned pixels keep their rays.
 
     A quarter turn moves the pixel at (x, y) to (y, width - x). The normalised image coordinates (u, v), which the lens

@@ -134,7 +134,11 @@ class Settings(NamedTuple):
     @classmethod
     def of(cls, sources: Sequence[Path], **options: Any) -> Settings:
         """Returns the settings for these sources and options of :func:`process`; options without effect are dropped."""
-        sizes = [(str(file), file.stat().st_size) for source in sources for file in files_of(source)]
+        sizes = [
+            (os.path.relpath(file, source.parent), file.stat().st_size)
+            for source in sources
+            for file in files_of(source)
+        ]
         listed = hashlib.sha256(json.dumps(sizes).encode(errors="surrogateescape")).hexdigest()
         paths = os.pathsep.join(str(path.resolve()) for path in sources)
         return cls(paths, listed, **{name: value for name, value in options.items() if name in cls._fields})

@@ -48,17 +48,13 @@ def placed(scene: Scene, other: Scene) -> Scene:
         ours, theirs = (each.background or "none" for each in (other, scene))
         raise SceneError(f"{scene.name}: background must be {ours}, as in {other.name}, got {theirs}")
     train, test = scene.train, scene.test
-    if other.transform is not None and scene.transform is not None:
-        motion = other.transform @ torch.linalg.inv(scene.transform)
-        if not torch.allclose(motion, torch.eye(4, dtype=motion.dtype, device=motion.device), atol=1e-6):
-            scale = float(torch.linalg.det(motion[:3, :3]).abs()) ** (1 / 3)
-            train, test = (replace(part, cameras=part.cameras.moved(motion)) for part in (train, test))
-            if train.sparse_depth is not None:
-                seen = train.sparse_depth
-                train = replace(train, sparse_depth=seen._replace(distances=scale * seen.distances))
-    elif other.transform is not None or scene.transform is not None:
-        frame = "moved, turned and scaled" if scene.transform is not None else "in the coordinates of its files"
-        raise SceneError(f"{scene.name}: must be in the frame of {other.name}, got a frame {frame} (--normalise)")
+    motion = other.transform @ torch.linalg.inv(scene.transform)
+    if not torch.allclose(motion, torch.eye(4, dtype=motion.dtype, device=motion.device), atol=1e-6):
+        scale = float(torch.linalg.det(motion[:3, :3]).abs()) ** (1 / 3)
+        train, test = (replace(part, cameras=part.cameras.moved(motion)) for part in (train, test))
+        if train.sparse_depth is not None:
+            seen = train.sparse_depth
+            train = replace(train, sparse_depth=seen._replace(distances=scale * seen.distances))
     return replace(other, name=scene.name, notes=scene.notes, train=train, test=test)
 
 
@@ -78,7 +74,9 @@ def read_scene(path: Path) -> Scene:
         box = _tensor("box", values["box"])
         if box is not None and (box.shape != (2, 3) or not bool((box[0] < box[1]).all())):
             raise ValueError("box must be its lowest and highest corner")
-        transform = _tensor("transform", values["transform"], torch.float64)
+        transform = _tensor("transform", values["transform"] or torch.eye(4, device="cpu").tolist(), torch.float64)
+        if transform is None or transform.shape != (4, 4) or not torch.linalg.det(transform):
+            raise ValueError("transform must be an invertible matrix [4, 4]")
         train, test = _split(values["train"]), _split(values["test"])
         space: dict[str, Any] = {"near": near, "far": far, "box": box, "contraction": contraction}
         return Scene(name=str(values["name"]), train=train, test=test, transform=transform, **space, **words)

@@ -5,7 +5,7 @@ c images of h x w pixels. World units and axes as in `voronerf.nerf.cameras`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -98,7 +98,7 @@ class Scene:
         contraction: the contraction of a scene without a box, or around a region of a scene; None to derive a sphere
             from the box or the cameras, see :meth:`space`.
         region: float32 [2, 3], the box that the rays of all trained pixels meet; None for the whole scene.
-        transform: float64 [4, 4], transform from the files' coordinates to the scene's; None for none, or if unknown.
+        transform: float64 [4, 4], transform from the files' coordinates to the scene's.
         notes: lines about how the files were read.
 
     Examples:
@@ -118,7 +118,7 @@ class Scene:
     kind: str = "object"
     contraction: Contraction | Perspective | None = None
     region: Tensor | None = None
-    transform: Tensor | None = None
+    transform: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64, device="cpu"))
     notes: tuple[str, ...] = ()
 
     @property

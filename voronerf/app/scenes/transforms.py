@@ -25,7 +25,7 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import find_files, none_exists
 from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.names import SUFFIX, has_masks, plain, split_by_lists, stay_inside
+from voronerf.app.scenes.names import COPIES, SUFFIX, has_masks, plain, split_by_lists, stay_inside
 from voronerf.app.scenes.photographs import CROPPED, ROUNDED, Reading, View, least_factor, photograph_scene
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.soundness import some_of
@@ -383,6 +383,8 @@ def capture_scene(
         sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*scaled[0])
         notes.append(f"images have {sizes}: their lenses are scaled")
     factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
+    if reading.downscale and COPIES.fullmatch(frames[0].path.parent.name):  # a folder images_N of reduced copies
+        factor = max(round(factor * max(headers[0].size) / max(views[0].size)), 1)
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
@@ -403,7 +405,7 @@ def time_notes(frames: Sequence[ListedImage]) -> list[str]:
 def _view(frame: ListedImage, header: Header) -> View:
     """Returns the view of a frame, with its lens; raises SceneError for an unsupported lens or distortion."""
     values, path = frame.values, frame.source
-    model = values.get("camera_model", "OPENCV")
+    model = values.get("camera_model") or "OPENCV"
     if model not in MODELS:
         raise SceneError(f"{path}: camera model {model!s:.60} is not supported, only {', '.join(MODELS)}")
     if other := [key for key in OTHER_RAYS if values.get(key)]:
@@ -500,7 +502,8 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
     """Reads the cameras of a transforms file, in the file's order; their images need not exist.
 
     A camera without ``w`` and ``h`` has the size of its image, if its lens is in pixels and the image exists, or else
-    twice its principal point, or else ``size``. Frames without a pose are left out.
+    twice its principal point, or else ``size``. A view of a stored image whose orientation tag turns it has the tag's
+    turns in its header. Frames without a pose are left out.
 
     Args:
         path: the file.
@@ -520,22 +523,32 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
         pose, _ = _scaled_pose(frame.get("transform_matrix"), f"{path}: frame {position}")
         values = {**shared, **_named_distortion(frame, path)}
         stated = [number(values, side, path, positive=True) for side in "wh"]
-        default = (_image_size(path, values) if None in stated else None) or size
-        width, height = (side or other for side, other in zip(stated, default))
-        header = Header((max(round(width), 1), max(round(height), 1)))
+        image = _image_header(path, values)
+        default = (_image_size(path, values, image) if None in stated else None) or size
+        width, height = (max(round(side or other), 1) for side, other in zip(stated, default))
+        turns = image.turns if image is not None and (image.size[0] < image.size[1]) == (width < height) else 0
+        header = Header((width, height), turns=turns)
         views.append(_view(ListedImage(path, pose, path, values), header))
     return views, _applied(entries, path)
 
 
-def _image_size(path: Path, values: dict[str, Any]) -> tuple[int, int] | None:
-    """Returns the size of a frame's image: its file's, or twice the principal point; None for a lens not in pixels."""
-    name, (cx, cy) = values.get("file_path"), (number(values, key, path, positive=True) for key in ("cx", "cy"))
-    if not any(values.get(key) for key in ("fl_x", "fl_y", "cx", "cy")):
-        return None
+def _image_header(path: Path, values: dict[str, Any]) -> Header | None:
+    """Returns the header of a frame's image; None if it does not exist in the file's folder."""
+    name = values.get("file_path")
     with contextlib.suppress(SceneError):
         image = _exact_file(path.parent, name) if isinstance(name, str) and is_text(name) else None
         if image is not None and not leads_outside(image, path.parent):
-            return read_header(image).size
+            return read_header(image)
+    return None
+
+
+def _image_size(path: Path, values: dict[str, Any], image: Header | None) -> tuple[int, int] | None:
+    """Returns the size of a frame's image: its file's, or twice the principal point; None for a lens not in pixels."""
+    if not any(values.get(key) for key in ("fl_x", "fl_y", "cx", "cy")):
+        return None
+    if image is not None:
+        return image.size
+    cx, cy = (number(values, key, path, positive=True) for key in ("cx", "cy"))
     if cx is None or cy is None:
         raise SceneError(f"{path}: must state w and h, or cx and cy, since its lens is in pixels")
     return round(2 * cx), round(2 * cy)
