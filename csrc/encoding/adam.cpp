@@ -43,8 +43,13 @@ AdamStep next_step(const AdamRule& rule) {
   const double step = static_cast<double>(*rule.step += 1.0f);
   const double root = std::pow(1.0 - std::pow(rule.decay_sq, step), 0.5);
   const double rate = rule.rate_at == nullptr ? rule.rate : *rule.rate_at;
-  return {static_cast<float>(rate * root / (1.0 - std::pow(rule.decay, step))), static_cast<float>(rule.decay),
-          static_cast<float>(rule.decay_sq), static_cast<float>(rule.epsilon * root), rule.dense};
+  return {static_cast<float>(rate * root / (1.0 - std::pow(rule.decay, step))),
+          static_cast<float>(rule.decay),
+          static_cast<float>(rule.decay_sq),
+          static_cast<float>(1.0 - rule.decay),
+          static_cast<float>(1.0 - rule.decay_sq),
+          static_cast<float>(rule.epsilon * root),
+          rule.dense};
 }
 
 // Calls body(tensor, begin, end) for the blocks of all tensors.
@@ -86,7 +91,12 @@ void average_cpu(float* const* averages, const float* const* parameters, const f
       return;
     }
     const float* __restrict__ parameter = parameters[i];
-    for (int64_t j = begin; j < end; ++j) average[j] += share * (parameter[j] - average[j]);
+    const float kept = 1.0f - share;
+    if (share < 0.5f) {
+      for (int64_t j = begin; j < end; ++j) average[j] += share * (parameter[j] - average[j]);
+    } else {  // as torch.lerp; exact for a share of 1
+      for (int64_t j = begin; j < end; ++j) average[j] = parameter[j] - kept * (parameter[j] - average[j]);
+    }
   });
 }
 

@@ -25,8 +25,8 @@ constexpr int kMost = 36;                      // parameters of a launch: their 
 
 __device__ __forceinline__ void update_entry(const AdamStep& rule, float g, float* parameter, float* mean,
                                              float* square, int64_t i) {
-  const float m = rule.decay * mean[i] + (1.0f - rule.decay) * g;
-  const float v = rule.decay_sq * square[i] + (1.0f - rule.decay_sq) * (g * g);
+  const float m = rule.decay * mean[i] + rule.fresh * g;
+  const float v = rule.decay_sq * square[i] + rule.fresh_sq * (g * g);
   mean[i] = m;
   square[i] = v;
   parameter[i] -= rule.step_size * (m / (sqrtf(v) + rule.epsilon));
@@ -109,8 +109,13 @@ __global__ void __launch_bounds__(kThreads)
   int number = 0;
   while (number + 1 < tensors.count && blockIdx.x >= tensors.of[number + 1].first) ++number;
   const AdamTensor& tensor = tensors.of[number];
-  const AdamStep rule{corrected[2 * number], static_cast<float>(tensor.rule.decay),
-                      static_cast<float>(tensor.rule.decay_sq), corrected[2 * number + 1], tensor.rule.dense};
+  const AdamStep rule{corrected[2 * number],
+                      static_cast<float>(tensor.rule.decay),
+                      static_cast<float>(tensor.rule.decay_sq),
+                      static_cast<float>(1.0 - tensor.rule.decay),
+                      static_cast<float>(1.0 - tensor.rule.decay_sq),
+                      corrected[2 * number + 1],
+                      tensor.rule.dense};
   const float scale = guard.scale == nullptr ? 1.0f : *guard.scale;
   const unsigned block = blockIdx.x - tensor.first;
   for (int part = 0; part < kRun / kThreads; ++part) {

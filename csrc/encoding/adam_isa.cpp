@@ -34,8 +34,8 @@ VN_INLINE int is_nonzero(const float* gradient) {
 VN_INLINE void update(const AdamStep& rule, const float* gradient, float* parameter, float* mean, float* square) {
   const F32 g = load(gradient), p = load(parameter), m = load(mean), v = load(square);
   const auto present = (g != F32{}) | (rule.dense ? -1 : 0);
-  const F32 new_m = rule.decay * m + (1.0f - rule.decay) * g;
-  const F32 new_v = rule.decay_sq * v + (1.0f - rule.decay_sq) * (g * g);
+  const F32 new_m = rule.decay * m + rule.fresh * g;
+  const F32 new_v = rule.decay_sq * v + rule.fresh_sq * (g * g);
   const F32 moved = p - rule.step_size * (new_m / (square_root(new_v) + rule.epsilon));
   store(mean, present ? new_m : m);
   store(square, present ? new_v : v);

@@ -12,6 +12,7 @@ namespace voronerf {
 struct AdamStep {
   float step_size;        // the learning rate, corrected for the moments' start at zero
   float decay, decay_sq;  // decay rates of the moments
+  float fresh, fresh_sq;  // 1 - decay, before it is rounded to float32
   float epsilon;          // with the same correction
   bool dense;             // also update entries with zero gradient, as torch does
 };

@@ -80,7 +80,7 @@ struct Tile {
   template <bool kBlurred>
   void values(Octaves<kBlurred>, float* out) const {
     encode(x, in.d, table, rows, columns(), out, stride);
-    if (kBlurred) blur(variances, in.d, table, rows, out, stride);
+    if (kBlurred) blur(variances, in.d, in.d, table, rows, out, stride);
   }
 
   // Turns gradients g [rows][width] into gradients of x and of the variances, [rows][d].

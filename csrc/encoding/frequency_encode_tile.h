@@ -249,16 +249,22 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 #endif
 }
 
-// Multiplies encoded rows by the damping factors of the variances, for d <= kLanes and an encoding without x itself.
-// Rows are as in `encode`.
-void blur(const float* variances, int64_t x_stride, const float* table, int64_t rows, float* out, int64_t stride) {
-  for (int64_t column = 0; column < stride; column += kLanes) {
-    Bits index;
-    __builtin_memcpy(&index, table + column, sizeof index);
-    const F32 scale = load(table + stride + column), slope = splat(-0.5f) * scale * scale;
-    for (int64_t row = 0; row < rows; ++row) {
+// Multiplies encoded rows by the damping factors of the d variances, for an encoding without x itself. Rows are as in
+// `encode`. No more than d variances of a row are read, which may be the last of their tensor.
+void blur(const float* variances, int64_t d, int64_t x_stride, const float* table, int64_t rows, float* out,
+          int64_t stride) {
+  for (int64_t row = 0; row < rows; ++row) {
+    const float* from = variances + row * x_stride;
+    float lanes[kLanes] = {};
+    if (d <= kLanes) __builtin_memcpy(lanes, from, static_cast<size_t>(d) * sizeof(float));
+    const F32 few = load(lanes);
+    for (int64_t column = 0; column < stride; column += kLanes) {
+      Bits index;
+      __builtin_memcpy(&index, table + column, sizeof index);
+      for (int lane = 0; d > kLanes && lane < kLanes; ++lane) lanes[lane] = from[index[lane]];
+      const F32 scale = load(table + stride + column), slope = splat(-0.5f) * scale * scale;
       float* at = out + row * stride + column;
-      const F32 exponent = permute(load(variances + row * x_stride), index) * slope;
+      const F32 exponent = (d <= kLanes ? permute(few, index) : load(lanes)) * slope;
       const F32 left = exponent < splat(-87.0f) ? splat(0.0f) : exponential(exponent);
       store(at, load(at) * left);
     }

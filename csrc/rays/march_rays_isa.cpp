@@ -89,7 +89,7 @@ void count(const MarchInputs& in, uint32_t* mask, int32_t* counts, int64_t begin
 template <typename Spacing>
 VN_INLINE bool wide(const MarchRay& ray) {
   const float largest = __builtin_fmaxf(__builtin_fabsf(ray.near), __builtin_fabsf(ray.far));
-  return Spacing::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
+  return ray.far > ray.near && Spacing::has_inverse(ray) && ray.far - ray.near >= 1e-5f * ray.count * largest;
 }
 
 // Returns an upper bound on the voxels that a ray crosses per unit of distance, valid for the next kMarchRoom voxels.

@@ -10,7 +10,7 @@ import torch
 from adam_steps import assert_adam
 from op_cases import refused, strided
 
-from voronerf.ops import Guard, UpdateRule, adam
+from voronerf.ops import Guard, UpdateRule, adam, average
 from voronerf.ops._core import native
 
 pytestmark = pytest.mark.op("adam")
@@ -45,6 +45,26 @@ def test_leaves_out_a_step_wherever_a_gradient_is_not_finite(device, backend):
     adam(rules, *tensors, guard=guard, loss=guard.skip + 1, backend=backend)
     assert not guard.skip and not guard.in_a_row and float(guard.skipped) == len(places)
     assert all(bool((parameter != 1).all()) and rule.step for parameter, rule in zip(tensors[0], rules, strict=True))
+
+
+def test_decay_rates_near_1(device, backend):
+    parameter, step = torch.ones(64, device=device), torch.zeros((), device=device)
+    exact = torch.ones(64, device=device, requires_grad=True)
+    betas, moments = (0.9, 0.9999999), [torch.zeros(64, device=device) for _ in range(2)]
+    theirs = torch.optim.Adam([exact], 0.01, betas)
+    for number in range(3):
+        exact.grad = torch.linspace(0.5, 1, 64, device=device) + number
+        rule = UpdateRule(step, 0.01, betas=betas)
+        adam([rule], [parameter], [exact.grad], *([moment] for moment in moments), backend=backend)
+        theirs.step()
+    torch.testing.assert_close(parameter, exact.detach(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.op("average")
+def test_the_whole_share_is_a_copy(device, backend):
+    averages, parameters = ([torch.full((40,), value, device=device)] for value in (1e8, 1.5))
+    average(averages, parameters, 1.0, backend=backend)
+    assert torch.equal(averages[0], parameters[0])
 
 
 def test_a_table_may_have_any_gradient(device, backend):

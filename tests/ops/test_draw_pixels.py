@@ -47,6 +47,12 @@ def test_native_draws_are_those_of_the_reference(name, count):
 
 
 @pytest.mark.parametrize("backend", ["reference", "native"])
+def test_consecutive_seeds_draw_different_pixels(backend):
+    drawn = [draw(torch.tensor([seed], dtype=torch.int32), 500, 10**9, backend=backend)[0] for seed in (7, 8)]
+    assert len(torch.cat(drawn).unique()) > 990
+
+
+@pytest.mark.parametrize("backend", ["reference", "native"])
 def test_tables_of_runs_that_do_not_fit_each_other_stay_in_bounds(backend):
     runs = runs_of([2, 10, 50], [7, 100, 3])
     for change in (

@@ -122,6 +122,16 @@ def test_derivative_of_every_function(name: str, order: int) -> None:
     torch.testing.assert_close(ours.double(), exact, rtol=3e-6, atol=3e-6 * max(1.0, float(exact.abs().max())))
 
 
+@pytest.mark.parametrize("width", [2, 6, 16, 34, 80])
+def test_integrated_encoding_of_any_width(width: int) -> None:
+    b = Builder()
+    x = b.input(width)
+    program = b.program([b.encode("integrated", x, 3), b.linear(x, b.parameter(5, width), 5)])
+    for isa in native.SUPPORTED_ISAS:
+        with native.using_isa(isa):
+            check(program, [40, 0, 23])
+
+
 FAR = [*(sign * 10.0**size for size in (-30, -3, 0, 1, 1.5, 2, 3, 10, 19, 30, 38) for sign in (-1, 1)), 0.0, 88.5]
 SPECIAL = [
     *((name, (1.0, 20.0), FAR) for name in ("exp", "sigmoid", "tanh", "silu", "gelu", "softplus", "elu")),

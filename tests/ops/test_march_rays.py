@@ -183,6 +183,9 @@ def test_rays_of_no_length_and_of_no_numbers_have_no_samples(device, backend):
     result = march(arguments, 8, device, backend)
     assert result.ray_offsets[:6].tolist() == [0] * 6 and result.ray_offsets[6] > 0
     assert result.stop.tolist() == [8] * 6
+    arguments["near"][:] = arguments["far"][:] = 0
+    for samples in (8, 256):
+        assert march(arguments, samples, device, backend).ray_offsets.tolist() == [0] * 7
 
 
 def test_refuses_what_makes_no_sense():

@@ -8,19 +8,6 @@ namespace voronerf {
 namespace VN_ISA_NAMESPACE {
 namespace {
 
-VN_INLINE F32 square_root(F32 x) {
-#if VN_ISA == 2
-  return _mm512_maskz_sqrt_ps(0xffff, x);
-#elif VN_ISA == 1
-  return _mm256_sqrt_ps(x);
-#else
-  float lanes[kLanes];
-  store(lanes, x);
-  for (int i = 0; i < kLanes; ++i) lanes[i] = __builtin_sqrtf(lanes[i]);
-  return load(lanes);
-#endif
-}
-
 // Returns log x. With x = 2^e m and m from sqrt(1/2) to sqrt 2, it is e log 2 + 2 atanh((m - 1) / (m + 1)).
 VN_INLINE F32 logarithm(F32 x) {
   const F32 zero = splat(0.0f), one = splat(1.0f), least = splat(1.17549435e-38f);

@@ -449,7 +449,7 @@ struct ProgramTile {
       float* const pairs = step.pairs < 0 ? nullptr : slot(step.pairs);
       encode(x.data, x.stride, table, rows, columns, to, stride, pairs, stride_of(step.width), left_of(step.width),
              pairs == nullptr || step.floats);
-      if (kBlurred) blur(x.data + columns.d, x.stride, table, rows, to, stride);
+      if (kBlurred) blur(x.data + columns.d, columns.d, x.stride, table, rows, to, stride);
       return;
     }
     const Operand g = operand(operands[1]), value = operand(operands[2]);

@@ -4,7 +4,6 @@
 //   shape_tiles    sets each register's number of rows and bytes per row, and zeros all registers
 //   tile_load      loads rows `stride` bytes apart
 //   tile_store     stores rows `stride` bytes apart
-//   tile_zero      sets a register to 0
 //   tile_products  C[m][n] += sum over k of A[m][2k] B[k][2n] + A[m][2k+1] B[k][2n+1], with B in pairs of
 //                  rows. Sums are float32, rounded to the nearest; denormals are 0.
 //   release_tiles  releases the registers
@@ -31,10 +30,6 @@ struct alignas(64) TileShapes {
 
 VN_INLINE void shape_tiles(const TileShapes& shapes) { asm volatile("ldtilecfg %0" ::"m"(shapes)); }
 VN_INLINE void release_tiles() { asm volatile("tilerelease"); }
-template <int T>
-VN_INLINE void tile_zero() {
-  asm volatile("tilezero %%tmm%c0" ::"i"(T));
-}
 template <int T>
 VN_INLINE void tile_load(const void* from, int64_t stride) {
   asm volatile("tileloadd (%0,%1,1), %%tmm%c2" ::"r"(from), "r"(stride), "i"(T) : "memory");
@@ -64,10 +59,6 @@ VN_INLINE void shape_tiles(const TileShapes& shapes) {
   for (int i = 0; i < 8; ++i) tiles()[i] = {shapes.rows[i], shapes.bytes[i], {}};
 }
 VN_INLINE void release_tiles() { shape_tiles({}); }
-template <int T>
-void tile_zero() {
-  tiles()[T] = {tiles()[T].rows, tiles()[T].bytes, {}};
-}
 template <int T>
 void tile_load(const void* from, int64_t stride) {
   Tile& tile = tiles()[T];

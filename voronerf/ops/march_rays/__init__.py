@@ -72,8 +72,8 @@ def march_rays(
         box: the lowest and the highest corner of the grid.
         samples: the number of strata of a ray, s, 1 to 65,535.
         uniforms: the relative position of each sample in its stratum, 0 to 1; None for the middle.
-        seed: a seed instead of ``uniforms``. The uniforms are then hashes of the stratum and of seed + ray, the same on
-            every backend.
+        seed: a seed instead of ``uniforms``. The uniforms are then hashes of seed, ray and stratum, the same on every
+            backend.
         spacing: the spacing of the strata, "linear" or "disparity" (equal steps of 1 / distance).
         start: the first stratum to consider, >= 0; None for 0.
         max_samples: the largest number of samples of a ray, at least 1; None for all.

@@ -41,8 +41,8 @@ def nearest_centre(
         points: the points to locate, n < 2**31, d = 1 to 4. float16 and bfloat16 are compared in float32.
         centres: the centres of the cells, finite, k >= 1.
         index: the result of `index_centres` for these centres. The time then grows with log k, and the cells are the
-            same. Without an index, the CPU makes one for the call if there are at least 2,048 centres and 1,024 points.
-            The reference and Warp backends ignore the index.
+            same. Without an index, the CPU makes one for the call if there are at least 2,048 centres and 1,024 points
+            or, in four dimensions, 64 points. The reference and Warp backends ignore the index.
 
     Returns:
         int32 [n], the cell of each point, 0 to k - 1.

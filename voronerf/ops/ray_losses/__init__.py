@@ -64,7 +64,8 @@ def sparse_depth_loss(
         deltas: the lengths of the samples' ray segments.
         weights: the rendering weights of the samples.
         ray_offsets: ray i owns samples ``ray_offsets[i]`` to ``ray_offsets[i + 1]``.
-        distances: the distance of the point on each of the first s rays, s <= r; NaN for no point.
+        distances: the distance of the point on each of the first s rays, s <= r. The loss of a ray whose distance is
+            NaN is ``-log(0.001)``, without a gradient.
         factor: the factor on the mean of the losses.
 
     Raises:

@@ -42,8 +42,9 @@ def unseen_rays(
 
     Ray ``r - 3 triples + i`` keeps its direction d, and its origin moves randomly, by at most ``move`` along each axis.
     Rays ``r - 2 triples + i`` and ``r - triples + i`` get the same origin and the directions ``d + t`` and ``d - t``,
-    normalised, with t orthogonal to d. Along each axis t is at most ``tilt`` times ``2 ** -4u``, with a random number u
-    in 0 to 1, so that the angles to the neighbours are distributed evenly over four octaves. Not differentiable.
+    normalised. t is a random vector whose coordinates are at most ``tilt`` times ``2 ** -4u``, projected to be
+    orthogonal to d. u is a random number in 0 to 1, so that the angles to the neighbours are distributed evenly over
+    four octaves. Not differentiable.
 
     Args:
         origins: the origins of the rays, contiguous.
@@ -51,7 +52,7 @@ def unseen_rays(
         seed: the seed; each random number is a hash of the seed and of the ray.
         triples: the number of triples, at most r / 3.
         move: the largest move of an origin along an axis.
-        tilt: the largest change of a direction along an axis.
+        tilt: the largest coordinate of t before the projection.
 
     Raises:
         ValueError: more triples than a third of the rays; tensors that are not contiguous.
