@@ -286,23 +286,3 @@ def threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def instruction_set(name: str | None) -> Iterator[None]:
-    """Sets the instruction set of native CPU kernels inside the block; None does not change it.
-
-    VORONERF_ISA does the same for a whole process.
-
-    Raises:
-        ValueError: This processor lacks the instruction set.
-    """
-    if name is None:
-        yield
-        return
-    from voronerf.ops._core import native
-
-    if name not in native.SUPPORTED_ISAS:
-        raise ValueError(f"this processor has no {name}")
-    with native.using_isa(name):
-        yield

@@ -31,7 +31,7 @@ os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "65536")
 
 import harness
 import torch
-from harness import Others, Parser, Peaks, Stopwatch, Timing, instruction_set, measure, threads, write_results
+from harness import Others, Parser, Peaks, Stopwatch, Timing, measure, threads, write_results
 from ops import cases_any, cases_foreign, cases_hash, cases_lookup, cases_network, cases_sampling, cases_step
 from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 
@@ -136,7 +136,7 @@ class Bench:
         if not names:
             return []
         self.clock = time.process_time if case.threads == 1 else time.perf_counter
-        with instruction_set(case.isa), threads(case.threads):
+        with threads(case.threads):
             rows = self._measure(case, names, case.build(self.device))
         self.rows += rows
         return rows

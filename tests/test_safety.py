@@ -13,7 +13,6 @@ from voronerf.ops._core.layers import MLP, Layer
 pytestmark = pytest.mark.native
 
 LAYERS = MLP((Layer(("positions",), 7, "sine"),), (0,))
-BAD = (torch.nan, torch.inf, -torch.inf)
 
 
 def halves(points):
@@ -102,43 +101,3 @@ if child == 0:
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     python("-c", code)
-
-
-def agree(op, *args):
-    """Returns the native result; fails unless it is close to the reference, with the same NaNs and infinities."""
-    native, reference = (op(*args, backend=backend) for backend in ("native", "reference"))
-    torch.testing.assert_close(native, reference, equal_nan=True, rtol=1e-4, atol=1e-5)
-    return native
-
-
-@pytest.mark.parametrize("bad", BAD)
-def test_odd_numbers_propagate_as_in_the_reference(bad):
-    points = torch.rand(70, 3)
-    points[::9, 1] = bad
-    centres, weight = torch.rand(5, 3), torch.rand(5, 6, 3) - 0.5
-    cells = agree(v.nearest_centre, points, centres)
-    assert cells[::9].eq(0).all()
-    order, offsets = v.cell_sort(cells, 5)
-    for broken in (weight, weight.masked_fill(torch.rand(weight.shape) < 0.05, bad)):
-        agree(v.grouped_linear, points[order.long()], offsets, broken)
-    for octaves in (0, 4):
-        agree(v.frequency_encode, points, octaves)
-    agree(v.spherical_harmonics, points, 4)
-    variances = torch.rand(70, 3)
-    variances[::7, 2] = bad
-    agree(v.integrated_encode, torch.rand(70, 3), variances.abs(), 4)
-
-
-# Densities are at least 0, so minus infinity is not a valid input.
-@pytest.mark.parametrize(
-    ("where", "bad"),
-    [(where, bad) for where in ("sigma", "rgb", "depths") for bad in BAD[: 2 if where == "sigma" else 3]],
-)
-def test_odd_numbers_along_rays(where, bad):
-    values = {"sigma": torch.rand(8, 20), "rgb": torch.rand(8, 20, 3), "depths": torch.rand(8, 20)}
-    values[where][3, 7] = bad
-    for part in agree(v.composite, *values.values(), torch.rand(8, 20)):
-        assert part[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
-    weights, edges = torch.rand(8, 20), torch.rand(8, 21).sort(dim=1).values
-    weights[3, 7] = bad
-    agree(v.resample, weights, edges, 9)

@@ -77,7 +77,6 @@ class Case:
         build: A function that makes inputs and contenders on a device.
         backends: The backends of the rows; backends that cannot run are reported and omitted.
         quick: Whether --quick includes the case.
-        isa: The instruction set of the native backend; None selects the best one.
         threads: The number of threads; None keeps the process's number. A row of one thread is timed by CPU time, which
             other processes disturb less.
         needs: The op that determines the available backends; empty for ``op`` itself.
@@ -92,7 +91,6 @@ class Case:
     build: Callable[[torch.device], Work] = field(compare=False, repr=False)
     backends: tuple[str, ...] = ("native",)
     quick: bool = False
-    isa: str | None = None
     threads: int | None = None
     needs: str = ""
 

@@ -47,7 +47,6 @@ MLP_QUICK = {
     ("w64d4", BASE, 16, HALF, FORWARD),
     ("w64d4", BASE, 16, FULL, BACKWARD),
 }
-AVX2_ROWS = (("w64d4", BASE, 16, FULL, FORWARD), ("w64d4", BASE, 16, FULL, BACKWARD))
 
 ROUTE_ROWS: tuple[tuple[str, int, int, torch.dtype, str], ...] = (
     *[("w64d4", n, 16, FULL, FORWARD) for n in (BASE, 1 << 10, 1 << 14, 1 << 20)],
@@ -83,11 +82,6 @@ def cases() -> list[Case]:
         work = functools.partial(_mlp_work, row)
         name = f"{net} n={n} k={k}"
         rows.append(Case("grouped_mlp", name, dtype, direction, n, k, work, shown, row in MLP_QUICK))
-    for row in AVX2_ROWS:
-        net, n, k, dtype, direction = row
-        work = functools.partial(_mlp_work, row)
-        name = f"{net} n={n} k={k} avx2"
-        rows.append(Case("grouped_mlp", name, dtype, direction, n, k, work, isa="avx2"))
     for row in ROUTE_ROWS:
         net, n, k, dtype, direction = row
         work = functools.partial(route_work, *row, TOLERANCE[dtype, direction])

@@ -28,7 +28,6 @@ from ops import (
 from ops.case import NotApplicable
 
 import voronerf
-from voronerf.ops._core import native
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 CPU = torch.device("cpu")
@@ -81,16 +80,6 @@ def test_other_processes_are_noticed():
             most = max(most, others.cores() or 0.0)
         process.kill()
     assert most > 0.3
-
-
-@pytest.mark.native
-def test_instruction_set_is_forced_and_put_back():
-    before = native.describe()["instruction set"]
-    with harness.instruction_set("portable"):
-        assert native.describe()["instruction set"] == "portable"
-    assert before == native.describe()["instruction set"]
-    with pytest.raises(ValueError, match="no sse9"), harness.instruction_set("sse9"):
-        pass
 
 
 def test_every_operation_has_rows_in_both_modes():

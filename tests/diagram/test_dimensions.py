@@ -25,21 +25,6 @@ def nearest(points: Tensor, centres: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)
-@pytest.mark.parametrize(
-    ("k", "dtype"), [(1, torch.float32), (17, torch.float32), (17, torch.float64), (17, torch.float16)]
-)
-def test_locate(d: int, k: int, dtype: torch.dtype, generator: torch.Generator) -> None:
-    diagram = VoronoiDiagram(torch.randint(-4, 5, (k, d), generator=generator).float())
-    points = torch.randint(-4, 5, (11, 23, d), generator=generator).to(dtype)  # with ties
-    result = diagram.locate(points)
-    assert result.shape == (11, 23)
-    assert torch.equal(result.flatten().long(), nearest(points.reshape(-1, d), diagram.centres))
-    assert diagram.locate(points[:0]).shape == (0, 23)
-    points[0, 0] = float("nan")
-    assert diagram.locate(points)[0, 0] == 0
-
-
-@pytest.mark.parametrize("d", DIMENSIONS)
 def test_many_cells_have_an_index(d: int, generator: torch.Generator) -> None:
     diagram = VoronoiDiagram(torch.rand(2500, d, generator=generator))
     points = torch.rand(200, d, generator=generator)

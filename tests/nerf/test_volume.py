@@ -66,19 +66,6 @@ def test_against_slow_loop(spacing):
         assert float(result.depth[r]) == pytest.approx(depth / opacity if opacity > 1e-7 else far, abs=1e-4)
 
 
-def test_homogeneous_medium():
-    """With a constant density, opacity is 1 - exp(-sigma length) for any sampling."""
-
-    def fog(positions, directions, ray_index):
-        return torch.full_like(positions, 0.25), torch.full_like(positions[:, 0], 0.7)
-
-    for samples in (1, 5, 32):
-        result = render_rays(fog, rays(3), 1.0, 3.0, samples=samples, jitter=True)
-        opacity = 1 - math.exp(-1.4)
-        torch.testing.assert_close(result.opacity, torch.full((3,), opacity))
-        torch.testing.assert_close(result.colour, torch.full((3, 3), 0.25 * opacity))
-
-
 def test_rays_of_no_extent_show_the_background():
     ends, background = (torch.tensor([2.0, 2.0]), torch.tensor([2.0, 4.0])), torch.tensor((0.1, 0.2, 0.3))
     result = render_rays(ball, rays(2), *ends, samples=32, background=background)

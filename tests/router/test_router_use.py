@@ -295,18 +295,6 @@ def test_fused_under_autocast_is_as_near_to_float64_as_the_loop(make: type[nn.Mo
         assert error <= 2 * other + FLOOR[dtype] * right.norm()
 
 
-def test_inference_mode(generator: torch.Generator) -> None:
-    """A router constructed and called in inference mode, with inputs made there, can be trained afterwards."""
-    for options in ({"fuse": True}, {"way": "grouped"}, {"way": "loop"}):
-        with torch.inference_mode():
-            router, x = router_of(Heads(), generator, **options), uniform(generator, 50, 3)
-            before = router(x)
-        result = router(x)
-        torch.testing.assert_close(result, before.clone())
-        result.sum().backward()
-        assert all(p.grad is not None for name, p in router.named_parameters() if ".net." in name)
-
-
 class Labelled(Tensor):
     """A tensor with column names, as in PINA; results of functions are of this class, but have no names."""
 
