@@ -195,7 +195,8 @@ def measure(
                 seconds = stopwatch(run, following[name] + 1, count)
                 following[name] += count + 1
                 timings[name].seconds.append(seconds / count)
-            active = [name for name in active if not _done(timings[name].seconds, batch[name], limits[name])]
+            # In alternating order, so that no contender always follows the same one.
+            active = [name for name in active[::-1] if not _done(timings[name].seconds, batch[name], limits[name])]
     finally:
         if collecting:
             gc.enable()

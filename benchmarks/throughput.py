@@ -1,6 +1,6 @@
 """Times every operation and the whole route, beside alternatives and the machine's peak rates.
 
-    python benchmarks/throughput.py                                   everything, about twelve minutes on two cores
+    python benchmarks/throughput.py                                   everything, half an hour on two cores
     python benchmarks/throughput.py --quick                           every operation once, under a minute
     python benchmarks/throughput.py --filter '^grouped_mlp/w64d4.*bfloat16'
     python benchmarks/throughput.py --foreign --filter 'siren .*k=16'  the router with fields of other codebases
@@ -37,7 +37,13 @@ from ops.case import Case, Contender, NotApplicable, Work, dtype_name
 
 from voronerf.ops._core import backends
 
-OPTIONAL = {"scipy": "scipy", "warp": "warp-lang", "numba": "numba"}
+OPTIONAL = {
+    "scipy": "scipy",
+    "warp": "warp-lang",
+    "numba": "numba",
+    "pykdtree": "pykdtree",
+    "faiss": "faiss-cpu",
+}
 """Optional packages: module name -> package to install."""
 LIMITS = {"ours": 0.8, "alternative": 0.5}
 QUICK_LIMITS = {"ours": 0.3, "alternative": 0.15}
@@ -266,7 +272,7 @@ def lines(row: dict[str, Any], *, last: bool) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Measures the rows, prints them and writes the JSON."""
+    """Measures the rows and prints them; writes the JSON after each row."""
     options = parse(arguments)
     cases = chosen_cases(options)
     if options.list:
@@ -301,20 +307,20 @@ def main(arguments: list[str] | None = None) -> None:
             print("\n".join(lines(row, last=row is rows[-1])), flush=True)
         if rows and (rows[0]["other_load"] or 0.0) > DISTURBED:
             progress(f"    disturbed: other processes kept {rows[0]['other_load']:.1f} cores busy during this row")
-    write_results(
-        options.json,
-        bench.rows,
-        benchmark="throughput",
-        quick=options.quick,
-        filter=options.filter,
-        device=str(bench.device),
-        seconds=round(time.perf_counter() - start),
-        load=[round(value, 2) for value in load],
-        peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
-        installed=found,
-        missing=missing,
-        warp_cache="as it was" if options.quick else "empty",
-    )
+        write_results(
+            options.json,
+            bench.rows,
+            benchmark="throughput",
+            quick=options.quick,
+            filter=options.filter,
+            device=str(bench.device),
+            seconds=round(time.perf_counter() - start),
+            load=[round(value, 2) for value in load],
+            peaks={name: round(value * 1e-9, 1) for name, value in bench.peaks.found.items()},
+            installed=found,
+            missing=missing,
+            warp_cache="as it was" if options.quick else "empty",
+        )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from voronerf.ops import hash_encode, nearest_centre, routed_mlp, spherical_harm
 SAMPLES = 64
 """Samples of a ray."""
 CELLS = 16
-PRIMES = (1, 2654435761, 805459861)
+PRIMES = (1, 2654435761 - 2**32, 805459861)
 
 Encode = Callable[[Tensor, Tensor], Tensor]
 Network = Callable[..., Tensor]
@@ -55,19 +55,19 @@ def _samples(n: int, seed: int, device: torch.device) -> Tensor:
 
 
 def _corners(x: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
-    """Returns the table entries [n, L, 8] of the corners, and their weights."""
+    """Returns the table entries, int32 [n, L, 8], of the corners, and their weights."""
     scale, shift, side, entries, offset, hashed = (x.new_tensor(column) for column in zip(*grid.rows))
     where = x[:, None, :] * scale[:, None] + shift[:, None]
     steps = torch.tensor([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], device=x.device)
     below = where.floor()
     inside = (where - below)[:, :, None, :]
     weights = torch.where(steps == 1, inside, 1 - inside).prod(dim=3)
-    corner = below.long()[:, :, None, :] + steps
-    product = corner * torch.tensor(PRIMES, device=x.device)
-    side, entries = side.long()[:, None], entries.long()[:, None]
-    by_hash = (product[..., 0] ^ product[..., 1] ^ product[..., 2]) % entries
+    corner = below.int()[:, :, None, :] + steps.int()
+    product = corner * torch.tensor(PRIMES, device=x.device, dtype=torch.int32)
+    side, entries = side.int()[:, None], entries.int()[:, None]  # a hashed level has 2^b entries
+    by_hash = (product[..., 0] ^ product[..., 1] ^ product[..., 2]) & (entries - 1)
     dense = (corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])) % entries
-    return torch.where(hashed.bool()[:, None], by_hash, dense) + offset.long()[:, None], weights
+    return torch.where(hashed.bool()[:, None], by_hash, dense) + offset.int()[:, None], weights
 
 
 def _by_indexing(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
@@ -79,6 +79,13 @@ def _by_embedding_bag(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
     entries, weights = _corners(x, grid)
     found = F.embedding_bag(entries.view(-1, 8), table, per_sample_weights=weights.view(-1, 8), mode="sum")
     return found.view(len(x), -1)
+
+
+def _by_reading(x: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
+    from rival_ngp import ReadTable  # imports the application
+
+    entries, weights = _corners(x, grid)
+    return ReadTable.apply(table, entries.view(-1, 8), weights.view(-1, 8)).view(len(x), -1)
 
 
 def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device: torch.device) -> Work:
@@ -117,6 +124,7 @@ def hash_work(n: int, log2_entries: int, direction: str, compiled: bool, device:
     alternatives = {
         "torch, indexing": lambda: contender(functools.partial(_by_indexing, grid=grid)),
         "torch, F.embedding_bag": lambda: contender(functools.partial(_by_embedding_bag, grid=grid)),
+        "torch, F.embedding_bag, scatter_add_": lambda: contender(functools.partial(_by_reading, grid=grid)),
     }
     if compiled:
         alternatives["torch, indexing, torch.compile"] = compiling

@@ -168,7 +168,8 @@ def observe_work(m: int, device: torch.device) -> Work:
 
         def run(call: int) -> Results:
             function(density, occupied, box, *sets[call % count], **settings)
-            return [density, occupied.float()]
+            # The check of call 0 reads the densities after later calls have changed them.
+            return [density.clone(), occupied.float()] if call == 0 else [density, occupied]
 
         return Contender(run)
 

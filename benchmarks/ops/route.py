@@ -2,7 +2,7 @@
 
 The alternatives in torch look up the cells by the fastest installed method. Then they sort and loop over cells, or loop
 over boolean masks like Mega-NeRF, or, for few samples, gather a copy of the cell's parameters for each sample. All
-alternatives encode the positions themselves.
+alternatives encode the positions themselves, cell by cell or, after sorting, all at once.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def route_work(
         for piece in (None, PIECE):
             rows = f", {piece} rows" if piece else ""
             alternatives[f"torch sort + loop{rows}{suffix}"] = functools.partial(sorted_loop, batch, find, kind, piece)
+        alternatives[f"torch sort + encode + loop{suffix}"] = functools.partial(encoded_loop, batch, find, kind)
         alternatives[f"torch masks{suffix}"] = functools.partial(masked_loop, batch, find, kind)
         if n <= FEW:
             alternatives[f"torch gather + bmm{suffix}"] = functools.partial(gathered, batch, find, kind)
@@ -104,9 +105,15 @@ def synchronise(points: Tensor) -> None:
         torch.cuda.synchronize(points.device)
 
 
+@functools.cache
+def frequencies(octaves: int, device: torch.device) -> Tensor:
+    """Returns the frequencies of the octaves, [octaves, 1, 1]."""
+    return (2.0 ** torch.arange(octaves, device=device))[:, None, None]
+
+
 def torch_encode(x: Tensor, octaves: int, dtype: torch.dtype) -> Tensor:
     """Encodes all octaves at once: the input, then a sine and a cosine block for each octave."""
-    angles = x[:, None, None, :] * (2.0 ** torch.arange(octaves, device=x.device))[None, :, None, None]
+    angles = x[:, None, None, :] * frequencies(octaves, x.device)
     waves = torch.cat([angles.sin(), angles.cos()], 2)
     return torch.cat([x, waves.flatten(1)], 1).to(dtype)
 
@@ -122,17 +129,48 @@ def _of_rows(batch: Batch, directions: Tensor | None, rows: Tensor) -> Tensor | 
     return None if directions is None or batch.direction_index is None else directions[batch.direction_index[rows]]
 
 
-def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
-    """Returns a loop over sorted cells: sorts by the narrowest dtype, runs each cell, scatters the results."""
-    lookup, own = find(), Parameters(batch, dtype)
-    cells, octaves = own.cells(), batch.net.position_octaves or 0
+def sorting(batch: Batch, lookup: Callable[[Tensor], Any]) -> Callable[[Tensor], tuple[list[int], Tensor]]:
+    """Returns a function that sorts points by cell, with keys of the narrowest dtype: (bounds of the cells, order)."""
     key = torch.uint8 if batch.k <= 256 else torch.int16
     bounds = torch.arange(batch.k + 1, device=batch.positions[0].device)
 
+    def sort(points: Tensor) -> tuple[list[int], Tensor]:
+        keys, order = torch.sort(torch.as_tensor(lookup(points)).to(key), stable=True)
+        return torch.searchsorted(keys.int(), bounds).tolist(), order
+
+    return sort
+
+
+def encoded_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype) -> Contender:
+    """Returns a loop over sorted cells that encodes all points at once, and scatters all results at once."""
+    sort, own = sorting(batch, find()), Parameters(batch, dtype)
+    cells, octaves = own.cells(), batch.net.position_octaves or 0
+
     def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
         points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
-        keys, order = torch.sort(torch.as_tensor(lookup(points)).to(key), stable=True)
-        edges = torch.searchsorted(keys.int(), bounds).tolist()
+        edges, order = sort(points)
+        x, d = torch_encode(points[order], octaves, dtype), _of_rows(batch, directions, order)
+        yield (
+            order,
+            torch.cat(
+                [
+                    own.network(cells[cell], x[first:last], None if d is None else d[first:last])
+                    for cell, first, last in row_pieces(edges, None)
+                ]
+            ),
+        )
+
+    return _contender(batch, parts, own, dtype)
+
+
+def sorted_loop(batch: Batch, find: Callable[[], Any], dtype: torch.dtype, piece: int | None) -> Contender:
+    """Returns a loop over sorted cells, which runs each cell and scatters its results."""
+    sort, own = sorting(batch, find()), Parameters(batch, dtype)
+    cells, octaves = own.cells(), batch.net.position_octaves or 0
+
+    def parts(call: int) -> Iterator[tuple[Tensor, Tensor]]:
+        points, directions = batch.positions[call % len(batch.positions)], encoded_directions(batch, dtype)
+        edges, order = sort(points)
         for cell, first, last in row_pieces(edges, piece):
             rows = order[first:last]
             x = torch_encode(points[rows], octaves, dtype)

@@ -122,7 +122,7 @@ def test_the_claims_of_the_first_page() -> None:
     routed = [
         row["speedup_over_best"]
         for row in results("throughput.json")["results"]
-        if row["op"] == "routed_mlp" and row["backend"] == "native"
+        if row["op"] == "routed_mlp" and row["backend"] == "native" and row["n"] >= 1024
     ]
     assert f"{min(routed):.0f} to {max(routed):.0f} times" in text
     lookups = {

@@ -673,8 +673,8 @@ class _EntryMode(TorchDispatchMode):
             b = self.b.apply("affine", b, alpha)
         if kind in ("gt", "ge", "lt", "le"):
             a, b = (a, b) if kind[0] == "g" else (b, a)
-            if kind[1] == "e":
-                a, b = (self.b.apply(*_FINITE[:1], v, *_FINITE[1:]) for v in (a, b))
+            if kind[1] == "e":  # as `_FINITE`
+                a, b = (self.b.apply("clamp", operand, -_GREATEST, _GREATEST) for operand in (a, b))
             column = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
         else:
             column = self.b.binary(kind, a, b)
