@@ -9,7 +9,6 @@ The op is ``nearest_centre``: the public Python function, and the C++ function t
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +71,7 @@ def rows() -> dict[str, dict[str, Callable[[int], Any]]]:
         router, one = (VoronoiRouter(network(), torch.rand(k, 3), coords="first3", fuse=True) for k in (CELLS, 1))
         linears = [layer for layer in router.module if isinstance(layer, nn.Linear)]
         layers = [
-            (copy.deepcopy(linear.weight).mT.detach().requires_grad_(), copy.deepcopy(linear.bias)[:, None].detach())
+            (linear.weight.detach().mT.clone().requires_grad_(), linear.bias.detach()[:, None].clone().requires_grad_())
             for linear in linears
         ]
         ways: dict[str, Callable[[], Tensor]] = {
