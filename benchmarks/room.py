@@ -205,7 +205,6 @@ def quaternion(turn: Array) -> Array:
 @torch.no_grad()
 def depth_errors(renderer: Renderer, scene: Scene, folder: Path) -> dict[str, float]:
     """Returns the median relative depth error of held-out views, and the mean rendering weight in front of surfaces."""
-    assert scene.transform is not None
     scale = float(torch.linalg.det(scene.transform[:3, :3])) ** (1 / 3)
     errors, early = [], []
     for view, true in enumerate(torch.from_numpy(scale * np.load(folder / "depths.npy")).float()):

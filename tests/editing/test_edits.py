@@ -176,6 +176,7 @@ def test_an_object_is_placed_on_top(opened, tmp_path) -> None:
     thing = cut_run(opened[0], Solid(ball=(0, 0, 0, 0.5)), tmp_path / "thing")
     both = placed_run(opened[1], thing, (0.1, 0.2, 0.5), tmp_path / "both", scale=0.5)
     assert [part.layer for part in both.router] == [0, 1]
+    assert read_scene(both.path / "scene.json").train.names == opened[1].scene.train.names
     foot = both.router[1].frame.points(torch.cat((thing.scene.box.mean(0)[:2], thing.scene.box[0, 2:]))[None])
     assert torch.allclose(foot, torch.tensor([[0.1, 0.2, 0.5]]), atol=1e-5)
     points = torch.rand(500, 3) * 2 - 1
@@ -286,7 +287,15 @@ def test_pictures_are_where_the_joined_run_has_their_cameras(opened, scene, tmp_
     assert torch.equal(joined.scene.test.images, scene.test.images)
     record = read_scene(tmp_path / "joined" / "scene.json")
     assert record.test.names == tuple(f"{i}-{name}" for i in (0, 1) for name in scene.test.names)
-    assert torch.allclose(record.transform, frames[0].matrix @ scene.transform)
+
+
+def test_coordinates_of_files_are_the_first_runs(runs, tmp_path) -> None:
+    own, frame = Similarity.of((1, 2, 3), (10, 20, 30), 2.0).matrix, Similarity.of((3, 0, 0), (0, 0, 90), 0.5)
+    first = altered(runs[0], tmp_path / "first", transform=own)
+    joined = editing.join([first, runs[1]], tmp_path / "joined", frames=[frame, Similarity()])
+    record = read_scene(tmp_path / "joined/scene.json")
+    torch.testing.assert_close(record.transform, frame.matrix @ own)
+    torch.testing.assert_close(joined.scene.transform, frame.matrix @ own)
 
 
 @pytest.mark.slow

@@ -137,7 +137,8 @@ def test_exports_of_a_run(run, tmp_path, capsys, fails, monkeypatch):
     fails("the file must end in .html", "export", run, "--web page.htm")
     fails("no surface in the box", "export", run, "--crop 9 9 9 9.5 9.5 9.5 --points", tmp_path / "points.ply")
     fails("export needs a file: --points, --mesh, --cells or --web", "export", run)
-    fails("must name different files", "export", run, "--points a.ply --mesh ./a.ply")
+    twice = f"must name different files, got {tmp_path.resolve() / 'a.glb'} twice"
+    fails(twice, "export", run, "--points b.ply --mesh", tmp_path / "a.glb", "--cells", tmp_path / "./a.glb")
     fails("the file must end in .glb", "export", run, "--cells cells.stl")
     fails("--crop must be x y z of a corner and of", "export", run, "--crop 0 0 0 1 1 0 --mesh", files[0])
 

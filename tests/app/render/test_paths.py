@@ -388,13 +388,23 @@ def test_cameras_of_a_capture_are_in_the_coordinates_of_its_files(tmp_path, lens
         torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(COUNT, 3, 3), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("tag", [3, 6])
-def test_cameras_of_photographs_that_their_tags_turn(tmp_path, tag):
-    views = Cameras(POSES, torch.tensor([[20.0, 20, 6, 5]]).repeat(COUNT, 1), *SIZE)
-    write_capture(tmp_path, views, **LENSES["distorted"])
-    for path in tmp_path.glob("*.png"):
-        Image.open(path).save(path, exif=oriented(tag))
-    check_same_cameras(tmp_path / "transforms.json", load_scene(tmp_path))
+@pytest.mark.parametrize(
+    ("tags", "lens"),
+    [
+        ([3], LENSES["distorted"]),
+        ([6], LENSES["distorted"]),
+        ([6], {"fl_x": None, "camera_angle_x": 0.9}),
+        ([3, 6], {**LENSES["distorted"], "w": 10, "h": 12}),  # cameras of the upright pictures
+    ],
+)
+def test_cameras_of_photographs_that_their_tags_turn(tmp_path, tags, lens):
+    write_frames(tmp_path, POSES, "{:02d}.jpg".format, **lens)
+    for index in range(COUNT):
+        tag = tags[index % len(tags)]
+        size = SIZE if tags == [3] or tag == 6 else SIZE[::-1]
+        Image.new("RGB", size).save(tmp_path / f"{index:02d}.jpg", exif=oriented(tag))
+    cameras = check_same_cameras(tmp_path / "transforms.json", load_scene(tmp_path))
+    assert (cameras.width, cameras.height) == (SIZE if tags == [3] else SIZE[::-1])
 
 
 @pytest.mark.parametrize("normalise", [True, False])

@@ -59,8 +59,8 @@ def export(
     files = [file.resolve() for file in (points, mesh, cells, web) if file is not None]
     if not files:
         raise ConfigError("export needs a file: --points, --mesh, --cells or --web")
-    if len(set(files)) < len(files):
-        raise ConfigError(f"--points, --mesh, --cells and --web must name different files, got {files[0]} twice")
+    if twice := [file for file in files if files.count(file) > 1]:
+        raise ConfigError(f"--points, --mesh, --cells and --web must name different files, got {twice[0]} twice")
     for file, suffixes in outputs.items():
         if file is not None:
             check_export(file, suffixes)

@@ -164,8 +164,7 @@ def photograph_scene(
             if split[2]:
                 notes.append(f"{split[2]} images are in no list and are left out")
     views, more = _with_dynamic_masks(views, folder, reading.allow_outside)
-    fits_upright = any(map(_is_upright, views))
-    stored = [_as_stored(view) for view in views] if fits_upright else [*views]
+    stored = stored_views(views)
     turned = [view.path.name for view, changed in zip(views, stored) if changed is not view]
     if turned:
         more.append(f"cameras are those of pictures turned upright by their orientation tags: {some_of(turned)}")
@@ -278,11 +277,17 @@ def _is_upright(view: View) -> bool:
     return _fits(view.header.size[::-1], view.size) and not _fits(view.header.size, view.size)
 
 
-def _as_stored(view: View) -> View:
-    """Turns the camera of a view from the upright to the stored picture, if the camera fits the upright picture.
+def stored_views(views: Sequence[View]) -> list[View]:
+    """Returns views with the cameras of the stored pictures, of views with headers.
 
-    Only for scenes with cameras of upright pictures: the camera of a square or upside-down picture fits both pictures.
+    If one camera fits its picture only after the turn, all cameras see upright pictures: the camera of a square or
+    upside-down picture fits both.
     """
+    return [_as_stored(view) for view in views] if any(map(_is_upright, views)) else [*views]
+
+
+def _as_stored(view: View) -> View:
+    """Turns the camera of a view from the upright to the stored picture, if the camera fits the upright picture."""
     assert view.header is not None
     turns = view.header.turns
     upright = view.header.size[::-1] if turns % 2 else view.header.size

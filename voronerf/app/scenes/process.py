@@ -135,9 +135,7 @@ class Settings(NamedTuple):
     def of(cls, sources: Sequence[Path], **options: Any) -> Settings:
         """Returns the settings for these sources and options of :func:`process`; options without effect are dropped."""
         sizes = [
-            (os.path.relpath(file, source.parent), file.stat().st_size)
-            for source in sources
-            for file in files_of(source)
+            (os.path.relpath(file, source), file.stat().st_size) for source in sources for file in files_of(source)
         ]
         listed = hashlib.sha256(json.dumps(sizes).encode(errors="surrogateescape")).hexdigest()
         paths = os.pathsep.join(str(path.resolve()) for path in sources)

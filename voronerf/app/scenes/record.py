@@ -74,9 +74,9 @@ def read_scene(path: Path) -> Scene:
         box = _tensor("box", values["box"])
         if box is not None and (box.shape != (2, 3) or not bool((box[0] < box[1]).all())):
             raise ValueError("box must be its lowest and highest corner")
-        transform = _tensor("transform", values["transform"] or torch.eye(4, device="cpu").tolist(), torch.float64)
+        transform = _tensor("transform", values["transform"], torch.float64)
         if transform is None or transform.shape != (4, 4) or not torch.linalg.det(transform):
-            raise ValueError("transform must be an invertible matrix [4, 4]")
+            raise ValueError(f"transform must be an invertible matrix [4, 4], got {values['transform']!r:.60}")
         train, test = _split(values["train"]), _split(values["test"])
         space: dict[str, Any] = {"near": near, "far": far, "box": box, "contraction": contraction}
         return Scene(name=str(values["name"]), train=train, test=test, transform=transform, **space, **words)

@@ -25,8 +25,16 @@ from voronerf.app.scenes.errors import SceneError
 from voronerf.app.scenes.folders import find_files, none_exists
 from voronerf.app.scenes.images import Header, read_header
 from voronerf.app.scenes.lenses import COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, FOV, PERSPECTIVE, Lens
-from voronerf.app.scenes.names import COPIES, SUFFIX, has_masks, plain, split_by_lists, stay_inside
-from voronerf.app.scenes.photographs import CROPPED, ROUNDED, Reading, View, least_factor, photograph_scene
+from voronerf.app.scenes.names import SUFFIX, has_masks, plain, split_by_lists, stay_inside
+from voronerf.app.scenes.photographs import (
+    CROPPED,
+    ROUNDED,
+    Reading,
+    View,
+    least_factor,
+    photograph_scene,
+    stored_views,
+)
 from voronerf.app.scenes.scene import Scene
 from voronerf.app.scenes.soundness import some_of
 
@@ -383,8 +391,6 @@ def capture_scene(
         sizes = "{} x {} pixels, where {} says {:g} x {:g}".format(*scaled[0])
         notes.append(f"images have {sizes}: their lenses are scaled")
     factor = reading.downscale or least_factor(max(max(header.size) for header in headers))
-    if reading.downscale and COPIES.fullmatch(frames[0].path.parent.name):  # a folder images_N of reduced copies
-        factor = max(round(factor * max(headers[0].size) / max(views[0].size)), 1)
     return photograph_scene(path, folder, views, held_out, reading, factor=factor, notes=notes, transform=transform)
 
 
@@ -502,12 +508,12 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
     """Reads the cameras of a transforms file, in the file's order; their images need not exist.
 
     A camera without ``w`` and ``h`` has the size of its image, if its lens is in pixels and the image exists, or else
-    twice its principal point, or else ``size``. A view of a stored image whose orientation tag turns it has the tag's
-    turns in its header. Frames without a pose are left out.
+    twice its principal point, or else ``size``. Cameras see the images as stored; a view of an image that exists has
+    its header, with the turns of the orientation tag. Frames without a pose are left out.
 
     Args:
         path: the file.
-        size: (width, height) of images of unknown size.
+        size: (width, height) of upright images of unknown size.
 
     Returns:
         (the views, the transform float64 [4, 4] from the original coordinates to the coordinates of the poses).
@@ -524,12 +530,12 @@ def views_without_images(path: Path, size: tuple[int, int]) -> tuple[list[View],
         values = {**shared, **_named_distortion(frame, path)}
         stated = [number(values, side, path, positive=True) for side in "wh"]
         image = _image_header(path, values)
-        default = (_image_size(path, values, image) if None in stated else None) or size
+        default = _image_size(path, values, image) if None in stated else None
+        default = default or (size[::-1] if image is not None and image.turns % 2 else size)
         width, height = (max(round(side or other), 1) for side, other in zip(stated, default))
-        turns = image.turns if image is not None and (image.size[0] < image.size[1]) == (width < height) else 0
-        header = Header((width, height), turns=turns)
-        views.append(_view(ListedImage(path, pose, path, values), header))
-    return views, _applied(entries, path)
+        view = _view(ListedImage(path, pose, path, values), Header((width, height)))
+        views.append(view if image is None else view._replace(header=image))
+    return stored_views(views), _applied(entries, path)
 
 
 def _image_header(path: Path, values: dict[str, Any]) -> Header | None:
