@@ -312,6 +312,7 @@ def main(arguments: list[str] | None = None) -> None:
             bench.rows,
             benchmark="throughput",
             quick=options.quick,
+            cases=f"{number} of {len(cases)}",
             filter=options.filter,
             device=str(bench.device),
             seconds=round(time.perf_counter() - start),

@@ -16,8 +16,8 @@ VN_HD uint32_t mixed(uint32_t x) {
 }
 
 // `hash_key` returns the key of a ray; the seed is mixed first, since consecutive seeds would otherwise have the same
-// keys one ray apart. `hashed` returns the number with index `place` of the random numbers in [0, 1)
-// that belong to a key.
+// keys one ray apart. `hashed` returns the number with index `place` of the random numbers in [0, 1) that belong to a
+// key.
 VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
   return mixed(mixed(static_cast<uint32_t>(seed)) ^ static_cast<uint32_t>(ray));
 }

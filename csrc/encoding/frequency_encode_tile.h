@@ -253,18 +253,24 @@ void encode(const float* x, int64_t x_stride, const float* table, int64_t rows, 
 // `encode`. No more than d variances of a row are read, which may be the last of their tensor.
 void blur(const float* variances, int64_t d, int64_t x_stride, const float* table, int64_t rows, float* out,
           int64_t stride) {
-  for (int64_t row = 0; row < rows; ++row) {
-    const float* from = variances + row * x_stride;
-    float lanes[kLanes] = {};
-    if (d <= kLanes) __builtin_memcpy(lanes, from, static_cast<size_t>(d) * sizeof(float));
-    const F32 few = load(lanes);
-    for (int64_t column = 0; column < stride; column += kLanes) {
-      Bits index;
-      __builtin_memcpy(&index, table + column, sizeof index);
-      for (int lane = 0; d > kLanes && lane < kLanes; ++lane) lanes[lane] = from[index[lane]];
-      const F32 scale = load(table + stride + column), slope = splat(-0.5f) * scale * scale;
+  // A vector that begins with the variances of one of these rows ends before the last row does.
+  const int64_t whole = d <= kLanes ? rows - (kLanes - d + x_stride - 1) / x_stride : 0;
+  for (int64_t column = 0; column < stride; column += kLanes) {
+    Bits index;
+    __builtin_memcpy(&index, table + column, sizeof index);
+    const F32 scale = load(table + stride + column), slope = splat(-0.5f) * scale * scale;
+    for (int64_t row = 0; row < rows; ++row) {
+      const float* from = variances + row * x_stride;
+      F32 variance;
+      if (row < whole) {
+        variance = permute(load(from), index);
+      } else {
+        float lanes[kLanes];
+        for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = from[index[lane]];
+        variance = load(lanes);
+      }
       float* at = out + row * stride + column;
-      const F32 exponent = (d <= kLanes ? permute(few, index) : load(lanes)) * slope;
+      const F32 exponent = variance * slope;
       const F32 left = exponent < splat(-87.0f) ? splat(0.0f) : exponential(exponent);
       store(at, load(at) * left);
     }

@@ -53,6 +53,13 @@ def forward(arguments, backend="auto"):
     return raw.float(), tape
 
 
+@pytest.mark.parametrize("k", [1, 2])
+def test_rows_beyond_the_tensor_or_below_0_do_not_count(k):
+    for rows, count in ((-1, 0), (0, 0), (5, 5), (9, 5)):
+        cells = Cells(centres=torch.zeros(k, 3), rows=torch.tensor([rows], dtype=torch.int32))
+        assert cells.sort(torch.rand(5, 3), k).offsets.tolist() == [0, *[count] * k]
+
+
 def parameters_of(arguments):
     return [*arguments["weights"], arguments["biases"][0], arguments["features"]]
 

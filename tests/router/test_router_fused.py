@@ -130,10 +130,14 @@ SPECIAL: dict[str, Callable[[Tensor], Tensor]] = {
     "hardtanh": F.hardtanh,
     "amax": lambda x: x.amax(-1),
     "amin": lambda x: x.amin(-1, keepdim=True),
+    "where the largest are": lambda x: (0.85 * x >= (0.85 * x).amax(-1, keepdim=True)) * x,
+    "large entries": lambda x: (x * 7e37).amax(-1) * 1e-37,
+    "or": lambda x: x.relu() + ((x >= 1) + (x <= 1)),
     "std": lambda x: x / (x.std(-1, keepdim=True) + 1),
     "expm1": lambda x: 1e8 * torch.expm1(1e-8 * x),
     "log1p": lambda x: 1e8 * torch.log1p(1e-8 * x),
     "a masked softmax": lambda x: x.masked_fill(x < 0.5, -torch.inf).softmax(-1),
+    "a softmax masked by numbers": lambda x: torch.cat((x, x), -1).masked_fill(x[..., :1] < 1.5, -3e38).softmax(-1),
 }
 """Functions whose values or gradients are special at infinities, bounds, equal entries or small numbers."""
 

@@ -244,13 +244,14 @@ class Deep(nn.Module):
         (Encoder(), lambda held, x: held(x), lambda held: setattr(held, "alpha", 0.0)),
         (Encoder().__call__, lambda held, x: held(x), lambda held: setattr(held.__self__, "alpha", 0.0)),
         (partial(torch.mul, other=2.0), lambda held, x: held(x), lambda held: held.keywords.update(other=0.5)),
+        (partial(Encoder()), lambda held, x: held(x), lambda held: setattr(held.func, "alpha", 0.0)),
         (partial(scaled, [2.0]), lambda held, x: held(x), lambda held: held.args[0].__setitem__(0, 0.5)),
         ({"a": {"b": 2.0}}, lambda held, x: held["a"]["b"] * x, lambda held: held["a"].update(b=0.5)),
         ([[2.0]], lambda held, x: held[0][0] * x, lambda held: held[0].__setitem__(0, 0.5)),
         (types.SimpleNamespace(a=[torch.ones(1)]), lambda held, x: held.a[0] * x, lambda held: held.a[0].mul_(3)),
         (torch.distributions.Normal(0, 2), lambda held, x: held.scale * x, lambda held: setattr(held, "scale", 0.5)),
     ],
-    ids=["object", "method", "partial", "partial of a list", "dicts", "lists", "tensor", "library"],
+    ids=["object", "method", "partial", "partial object", "partial list", "dicts", "lists", "tensor", "library"],
 )
 def test_numbers_deep_in_an_attribute_are_followed(held: Any, read: Any, change: Any) -> None:
     router, x = VoronoiRouter(Deep(held, read), 2, fuse=True), torch.rand(40, 3)

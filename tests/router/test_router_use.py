@@ -238,24 +238,49 @@ def test_a_network_in_half_precision_between_floats_is_fused(generator: torch.Ge
     torch.testing.assert_close(actual, expected, rtol=0.02, atol=0.02)
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e6])
+def test_samples_mixed_in_half_precision(scale: float) -> None:
+    """Numbers that float16 cannot hold are compared too."""
+
+    class Mixes(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = nn.Linear(3, 4).half()
+
+        def forward(self, x: Tensor) -> Tensor:
+            y = self.layer(x.half()).float()
+            return (y - y.mean(0, keepdim=True)) * scale
+
+    router, cells = VoronoiRouter(Mixes(), 5), torch.arange(200) % 5
+    refuses("must treat samples one by one", router, torch.rand(200, 3), cells=cells, error=TypeError)
+
+
 @pytest.mark.parametrize("way", ["loop", "grouped"])
 def test_a_module_may_write_into_its_rows(way: str, generator: torch.Generator) -> None:
     class Writes(nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            self.layer = nn.Linear(3, 4)
+            self.layer, self.late = nn.Linear(3, 4), False
 
         def forward(self, x: Tensor) -> Tensor:
             x[..., 0] *= 2
-            return self.layer(x)
+            result = self.layer(x)
+            return result.cumsum(-1) if self.late else result.flip(-1)
 
     router = VoronoiRouter(Writes(), uniform(generator, 5, 3), coords="first3", way=way)
     x = uniform(generator, 120, 3)
-    actual, cells = router(x.clone()), router.diagram.locate(x)
-    actual.sum().backward()
-    written = torch.cat([2 * x[:, :1], x[:, 1:]], 1)
-    for cell, gradient in enumerate(router.module.layer.weight.grad):
-        torch.testing.assert_close(gradient, written[cells == cell].sum(0).expand(4, 3))
+    cells, written = router.diagram.locate(x), torch.cat([2 * x[:, :1], x[:, 1:]], 1)
+    for late in (False, True, False, True):
+        router.module.late = late
+        router.zero_grad()
+        actual = router(x.clone())
+        actual.sum().backward()
+        layer = router.module.layer
+        plain = torch.einsum("nd,nod->no", written, layer.weight[cells]) + layer.bias[cells]
+        torch.testing.assert_close(actual, plain.cumsum(-1) if late else plain.flip(-1))
+        for cell, gradient in enumerate(layer.weight.grad):
+            total = written[cells == cell].sum(0).expand(4, 3)
+            torch.testing.assert_close(gradient, total * torch.arange(4, 0, -1)[:, None] if late else total)
 
 
 class Fast(nn.Module):

@@ -544,7 +544,8 @@ class Grouped:
         for p in cell_parameters(call.module):
             pieces.append((p, dict(zip(sizes, p.split(list(sizes.values())) if len(sizes) > 1 else (p,), strict=True))))
         values, widest, tables, double = [], 1, dict[Any, Any](), Double(call.module)
-        for part, rows in zip(parts, split_rows(arguments, [part.n for part in parts]), strict=True):
+        counts = [part.n for part in parts]
+        for index, (part, rows) in enumerate(zip(parts, split_rows(arguments, counts), strict=True)):
             origin = part.start
             stand_ins = {id(p): PerCell(piece[origin], (p, origin)) for p, piece in pieces}
             for steps in reversed(self.records):
@@ -558,6 +559,7 @@ class Grouped:
                         raise
                 if run.failed is None or not run.failed.is_new:
                     break
+                rows = split_rows(call.arranged(grouping), counts)[index]  # the failed steps may have written into them
             if run.failed is not None:
                 raise run.failed
             self.records = [*(other for other in self.records if other is not steps), steps]
@@ -566,7 +568,7 @@ class Grouped:
                 raise Ungroupable("a result is made of parameters alone")
             widest = max(widest, run.widest)
         self.widest = widest
-        return Results.joined(values, [part.n for part in parts], grouping)
+        return Results.joined(values, counts, grouping)
 
 
 @dataclass

@@ -349,7 +349,10 @@ def recordable(tensor: Tensor) -> Tensor:
 
 
 def split_rows(rows: list[Tensor], sizes: list[int]) -> list[Sequence[Tensor]]:
-    """Splits the rows of all arguments into parts of these sizes. A module may write into its part."""
+    """Splits the rows of all arguments into parts of these sizes.
+
+    A module may write into its part, if there are several; one part is the rows themselves.
+    """
     return [rows] if len(sizes) == 1 else list(zip(*[t.unsafe_split_with_sizes(sizes) for t in rows], strict=True))
 
 

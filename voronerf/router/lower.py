@@ -105,14 +105,16 @@ def _reduced(combine: Callable[[Tensor, Tensor], Tensor], x: Tensor, dims: Any =
 
 
 def _maximum(x: Tensor, y: Tensor) -> Tensor:
-    # Equal operands get half of the gradient each.
-    return torch.where(x > y, x, torch.where(x < y, y, (x + y) / 2))
+    # Equal operands get half of the gradient each. Their sum may overflow.
+    return torch.where(x > y, x, torch.where(x < y, y, x / 2 + y / 2))
 
 
 def _largest(x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
     """Returns the largest entries; equal ones share the gradient evenly."""
-    is_largest = x >= _reduced(_maximum, x.detach(), dim, True)
-    return torch.where(is_largest, x, 0.0).sum(dim, keepdim) / is_largest.to(x.dtype).sum(dim, keepdim)
+    largest, finite = _reduced(_maximum, x.detach(), dim, True), x.clamp(-_GREATEST, _GREATEST)
+    zero, is_largest = finite - finite.detach(), x >= largest  # zero has the gradient of x, if x is finite
+    shared = torch.where(is_largest, zero, 0.0).sum(dim, True) / is_largest.to(x.dtype).sum(dim, True)
+    return largest + shared if keepdim else (largest + shared).squeeze(dim)
 
 
 def _below_largest(x: Tensor, dim: int) -> Tensor:
@@ -678,6 +680,8 @@ class _EntryMode(TorchDispatchMode):
             column = self.b.apply("step" if kind[1] == "t" else "at_least", self.b.binary("sub", a, b))
         else:
             column = self.b.binary(kind, a, b)
+            if kind == "add" and result.dtype == torch.bool:  # the sum of two truths is true
+                column = self.b.apply("clamp", column, 0, 1)
         return self._placed(column, places, result.shape)
 
     def _where(self, args: Any, result: Tensor) -> Entries:

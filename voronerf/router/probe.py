@@ -326,12 +326,7 @@ class Probe:
             return False
         dtypes = [t.dtype for t in (*b.tensors, *self._call.module.parameters()) if t.dtype in AGREE]
         lowest = max(dtypes, key=AGREE.__getitem__, default=torch.float32)
-
-        def rounded(tensor: Tensor) -> Tensor:
-            return tensor.to(lowest) if tensor.is_floating_point() else tensor
-
-        pairs = zip(a.tensors, b.tensors)
-        same_results = all(x.dtype == y.dtype and agree(rounded(x), rounded(y)) for x, y in pairs)
+        same_results = all(agree(x, y, AGREE[lowest]) for x, y in zip(a.tensors, b.tensors))
         return same_results and agree_gradients(our_gradients, their_gradients)
 
     def _fused(self, loop: Way, expected: Outcome, inputs: Sequence[Inputs]) -> Way:

@@ -158,13 +158,13 @@ def _containers(value: Any) -> tuple[Any, ...]:
     """Returns the containers and the attributes of plain objects that a value is or holds, at most `MOST`.
 
     Plain objects may be callable, such as an encoder; a bound method is its object, and a partial function its
-    arguments. Objects of libraries, such as a logger, are not looked into.
+    function and arguments. Objects of libraries, such as a logger, are not looked into.
     """
     pending, found = [value], dict[int, Any]()
     while pending and len(found) < MOST:
         item = pending.pop(0)
         if isinstance(item, partial):
-            pending += [item.args, item.keywords]
+            pending += [item.func, item.args, item.keywords]
         item = item.__self__ if isinstance(item, MethodType) else item
         of_library = type(item).__module__.partition(".")[0] in _LIBRARIES and not isinstance(item, _PLAIN)
         opaque = isinstance(item, (Tensor, nn.Module, type)) or (of_library and callable(item))

@@ -18,10 +18,11 @@ AGREE = {torch.float64: 1e-7, torch.float32: 1e-3, torch.float16: 5e-2, torch.bf
 """The allowed difference between two ways to run a network of some ten layers, relative to the largest magnitude."""
 
 
-def agree(actual: Tensor, expected: Tensor) -> bool:
+def agree(actual: Tensor, expected: Tensor, tolerance: float | None = None) -> bool:
     """Returns whether two results of one computation agree in shape, dtype and values.
 
-    Non-finite values must be equal and in the same places.
+    Values may differ by ``tolerance``, or else the tolerance of their dtype, times the largest value. Non-finite values
+    must be equal and in the same places.
     """
     if actual.shape != expected.shape or actual.dtype != expected.dtype:
         return False
@@ -34,7 +35,8 @@ def agree(actual: Tensor, expected: Tensor) -> bool:
     if not torch.equal(a.isfinite(), finite) or not torch.equal(a[~finite].nan_to_num(), b[~finite].nan_to_num()):
         return False
     a, b = a[finite], b[finite]
-    return not b.numel() or bool((a - b).abs().max() <= AGREE[expected.dtype] * b.abs().max() + 1e-12)
+    tolerance = AGREE[expected.dtype] if tolerance is None else tolerance
+    return not b.numel() or bool((a - b).abs().max() <= tolerance * b.abs().max() + 1e-12)
 
 
 def agree_gradients(actual: Sequence[Tensor], expected: Sequence[Tensor]) -> bool:

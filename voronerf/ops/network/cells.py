@@ -213,4 +213,4 @@ def _one_cell(positions: Tensor, rows: Tensor | None) -> Sorted:
     if rows is None:
         return Sorted(cells, None, torch.arange(2, dtype=torch.int32, device=device) * n)
     beyond = torch.arange(n, device=device) >= rows
-    return Sorted(cells.masked_fill(beyond, -1), None, torch.nn.functional.pad(rows.clamp(max=n), (1, 0)))
+    return Sorted(cells.masked_fill(beyond, -1), None, torch.nn.functional.pad(rows.clamp(0, n), (1, 0)))
