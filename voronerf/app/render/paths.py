@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from voronerf.app.files import json_text, read_json, write_text
-from voronerf.app.scenes.photographs import turned_cameras
+from voronerf.app.scenes.photographs import PARALLEL, turned_cameras
 from voronerf.app.scenes.scene import Scene
-from voronerf.app.scenes.transforms import views_without_images
+from voronerf.app.scenes.transforms import ORTHONORMAL, views_without_images
 from voronerf.nerf.cameras import Cameras, focus_point, look_at, shared_focus
 from voronerf.nerf.lenses import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
@@ -36,10 +36,6 @@ MOST_FRAMES = 100_000
 LONGEST_SIDE = 8192
 #: Greatest coordinate of a camera in scene units.
 FARTHEST = 1e9
-#: Tolerance of a rotation times its transpose against the identity, and of a pose's last row against 0 0 0 1.
-ORTHONORMAL = 2e-3
-#: Minimum length of the mean of the unit viewing directions for a capture to count as forward-facing.
-ONE_WAY = 0.95
 #: Angles around the cameras' focus, in radians. A path does not cross the widest gap between cameras if this gap is at
 #: least `GAP`. `WINDOW` is the standard deviation of the Gaussian weights by which a path averages the distances and
 #: heights of near cameras.
@@ -303,7 +299,7 @@ def capture_path(cameras: Cameras, count: int, *, near: float, far: float) -> Ca
         raise ValueError(f"capture_path: count must be at least 1, got {count}")
     forward = cameras.forward.double().mean(0)
     common = like_most(cameras)
-    if forward.norm() > ONE_WAY:
+    if forward.norm() > PARALLEL:
         poses = _spiral(cameras, count, focus_point(cameras), near, far)
     elif (focus := shared_focus(cameras)) is not None:
         poses = _around(cameras, count, focus.double())

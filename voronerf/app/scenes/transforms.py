@@ -41,6 +41,7 @@ from voronerf.app.scenes.soundness import some_of
 log = logging.getLogger(__name__)
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+#: Tolerance of a rotation times its transpose against the identity, and of a pose's last row against 0 0 0 1.
 ORTHONORMAL = 2e-3
 #: The largest magnitude of a number in a file; its inverse is the smallest value of a number that must be positive.
 #: Then float32 can represent the squares of these numbers.
