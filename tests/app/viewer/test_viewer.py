@@ -174,8 +174,9 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     text = pick(x, y)
     tab.set("Show", "opacity")  # grey except for the outline
     outlined = (tab.rest() * torch.tensor([1, -1, 1]).numpy()).sum(-1) > 300
-    cell_pixels = (run.diagram.locate(image.heaviest) == leaf).numpy() & (image.opacity > 0.5).numpy()
-    assert 0 < outlined.sum() < 0.5 * cell_pixels.sum() and outlined[cell_pixels].sum() >= 0.8 * outlined.sum()
+    cell_pixels = (run.diagram.locate(image.heaviest) == leaf) & (image.opacity > 0.5)
+    near = torch.nn.functional.max_pool2d(cell_pixels[None].float(), 3, 1, 1)[0] > 0  # the page's pixels may be one off
+    assert 0 < outlined.sum() < 0.5 * float(cell_pixels.sum()) and near.numpy()[outlined].all()
     tab.set("Show", "cells")
     tab.rest()
     assert f"**Cell {leaf}** of {run.diagram.num_cells}" in text and "centre " in text
