@@ -155,7 +155,7 @@ def _march_kernel(inputs: Inputs, counting: wp.bool, offsets: wp.array(dtype=wp.
         room = offsets[ray + 1] - row
     key = wp.uint32(0)
     if inputs.hashed:
-        key = _mixed(_mixed(wp.uint32(inputs.seed[0])) ^ wp.uint32(ray))
+        key = _mixed(wp.uint32(inputs.seed[0]) * _GOLDEN + wp.uint32(ray))
     samples = wp.int32(0)
     going = end > begin and stratum < inputs.samples
     while going:

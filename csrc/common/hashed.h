@@ -15,14 +15,14 @@ VN_HD uint32_t mixed(uint32_t x) {
   return x ^ x >> 16;
 }
 
-// `hash_key` returns the key of a ray; the seed is mixed first, since consecutive seeds would otherwise have the same
-// keys one ray apart. `hashed` returns the number with index `place` of the random numbers in [0, 1) that belong to a
-// key.
+// `hash_key` returns the key of a ray. `hashed` returns the number with index `place` of the random numbers in [0, 1)
+// that belong to a key. Multiples of 2^32 divided by the golden ratio keep the rays of near seeds apart.
+constexpr uint32_t kGolden = 0x9e3779b9u;
 VN_HD uint32_t hash_key(int32_t seed, int64_t ray) {
-  return mixed(mixed(static_cast<uint32_t>(seed)) ^ static_cast<uint32_t>(ray));
+  return mixed(static_cast<uint32_t>(seed) * kGolden + static_cast<uint32_t>(ray));
 }
 VN_HD float hashed(uint32_t key, uint32_t place) {
-  return static_cast<float>(static_cast<int32_t>(mixed(key ^ place * 0x9e3779b9u) >> 8)) * 0x1p-24f;
+  return static_cast<float>(static_cast<int32_t>(mixed(key ^ place * kGolden) >> 8)) * 0x1p-24f;
 }
 
 }  // namespace voronerf

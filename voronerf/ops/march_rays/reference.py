@@ -121,7 +121,7 @@ def march_rays(*arguments: Any) -> March:
 def hashed_uniforms(seed: Tensor, r: int, samples: int) -> Tensor:
     """Returns hashes of ray, stratum and seed (int32 [1]): [r, samples] in [0, 1), exact in float32."""
     ray, stratum = (torch.arange(count, device=seed.device) for count in (r, samples))
-    key = _mixed(ray ^ _mixed(seed.long()))
+    key = _mixed(ray + seed.long() * 0x9E3779B9)
     return (_mixed(key[:, None] ^ stratum * 0x9E3779B9) >> 8) / 2**24
 
 
