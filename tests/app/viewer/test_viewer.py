@@ -177,6 +177,7 @@ def test_cells_are_described_hidden_and_kept_alone(run, scene, tab) -> None:
     cell_pixels = (run.diagram.locate(image.heaviest) == leaf) & (image.opacity > 0.5)
     near = torch.nn.functional.max_pool2d(cell_pixels[None].float(), 3, 1, 1)[0] > 0  # the page's pixels may be one off
     assert 0 < outlined.sum() < 0.5 * float(cell_pixels.sum()) and near.numpy()[outlined].all()
+    assert cell_pixels.numpy()[outlined].mean() > 0.7
     tab.set("Show", "cells")
     tab.rest()
     assert f"**Cell {leaf}** of {run.diagram.num_cells}" in text and "centre " in text
