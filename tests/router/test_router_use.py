@@ -238,9 +238,8 @@ def test_a_network_in_half_precision_between_floats_is_fused(generator: torch.Ge
     torch.testing.assert_close(actual, expected, rtol=0.02, atol=0.02)
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1e6])
-def test_samples_mixed_in_half_precision(scale: float) -> None:
-    """Numbers that float16 cannot hold are compared too."""
+def test_samples_mixed_in_half_precision() -> None:
+    """Numbers below the least of float16 are compared too."""
 
     class Mixes(nn.Module):
         def __init__(self) -> None:
@@ -249,7 +248,7 @@ def test_samples_mixed_in_half_precision(scale: float) -> None:
 
         def forward(self, x: Tensor) -> Tensor:
             y = self.layer(x.half()).float()
-            return (y - y.mean(0, keepdim=True)) * scale
+            return (y - y.mean(0, keepdim=True)) * 1e-9
 
     router, cells = VoronoiRouter(Mixes(), 5), torch.arange(200) % 5
     refuses("must treat samples one by one", router, torch.rand(200, 3), cells=cells, error=TypeError)
